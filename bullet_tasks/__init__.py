@@ -1,0 +1,22 @@
+"""Small PyBullet worlds in which a robot must gather information before it acts; importing registers them with gymnasium."""
+
+import gymnasium
+
+from bullet_tasks.tasks.lateral_choice import LateralChoice
+
+# Environment id -> task class. The task module's ``make_env`` builds the environment.
+_TASKS = {"LateralChoice-v0": LateralChoice}
+
+ENV_IDS = tuple(_TASKS)
+
+for _env_id, _task_class in _TASKS.items():
+    gymnasium.register(
+        id=_env_id,
+        entry_point=f"{_task_class.__module__}:make_env",
+        max_episode_steps=_task_class().max_decisions,
+        # Both checks cost time at every step; the test suite runs them once for every registered task.
+        disable_env_checker=True,
+        order_enforce=False,
+    )
+
+__all__ = ["ENV_IDS"]

@@ -1,0 +1,172 @@
+"""The gymnasium environment: a robot, a task and sensors put together."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from bullet_tasks.robots.base import Robot
+from bullet_tasks.sensors import Sensor
+from bullet_tasks.simulation import Camera, Simulation
+from bullet_tasks.tasks.base import Outcome, Task
+
+_VIEWS = ("top", "follow")
+_FOLLOWING_SIZE = (480, 360)  # pixels
+# Relative to one substep: how far the decision period may be from a whole number of substeps.
+_PERIOD_TOLERANCE = 1e-6
+
+
+class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """
+    Robot x task x sensors.
+
+    Observations are a dict of ``common``, ``privileged`` and, if there is a sensor, ``target``. ``info`` holds
+    ``is_success`` (bool), ``position`` (float32 ``(2,)``, m) and ``reward_terms`` (name -> float, their sum is the reward).
+
+    An episode depends on its seed and the actions alone, not on what happened before: it is started by repositioning
+    bodies, which in PyBullet leaves no trace in later steps for a body without legs.
+
+    :param make_robot: creates the robot in a simulation
+    :param task: geometry, goal, rewards and ends
+    :param sensors: at most one; its readings are the ``target`` observation
+    :param render_mode: None, ``"rgb_array"`` or ``"human"``
+    :param view: ``"top"`` shows the whole scene, ``"follow"`` walks behind the robot
+    :raises ValueError: if an argument is not a possible choice
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(
+        self,
+        make_robot: Callable[[Simulation], Robot[Any]],
+        task: Task,
+        sensors: Sequence[Sensor] = (),
+        render_mode: str | None = None,
+        view: str = "top",
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"Unknown render_mode {render_mode!r}; known: None, {self.metadata['render_modes']}.")
+        if view not in _VIEWS:
+            raise ValueError(f"Unknown view {view!r}; known: {_VIEWS}.")
+        if len(sensors) > 1:
+            raise ValueError(f"At most one sensor can yield the `target` observation, got {len(sensors)}.")
+        self.task = task
+        self.sensors = tuple(sensors)
+        self.render_mode = render_mode
+        self.view = view
+        self.decision_period = task.decision_period
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / task.decision_period)}
+        observations = {"common": task.common_space, "privileged": task.privileged_space}
+        if self.sensors:
+            observations["target"] = self.sensors[0].space
+        self.observation_space = spaces.Dict(observations)
+        self.action_space = task.action_space
+        self._action_shape = task.action_space.shape
+
+        self.simulation = Simulation(gui=render_mode == "human")
+        try:
+            self.scene = task.scene
+            self.scene.build(self.simulation)
+            self.robot = make_robot(self.simulation)
+            substeps = task.decision_period / self.robot.substep_period
+            if round(substeps) < 1 or abs(substeps - round(substeps)) > _PERIOD_TOLERANCE:
+                raise ValueError(
+                    f"`decision_period` ({task.decision_period} s) must be a whole number of the robot's substeps "
+                    f"({self.robot.substep_period} s)."
+                )
+        except BaseException:
+            self.simulation.close()
+            raise
+        self._substeps = range(round(substeps))
+        self._elapsed_substeps = 0
+        self._substeps_in_limit = task.time_limit / self.robot.substep_period
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """
+        Start an episode.
+
+        :param seed: of the random numbers from now on
+        :param options: none are known
+        :raises ValueError: if there are options
+        """
+        super().reset(seed=seed)
+        if options:
+            raise ValueError(f"Unknown reset options {sorted(options)}; this environment has none.")
+        start = self.task.reset(self.np_random)
+        self.scene = self.task.scene.moved(start.placements)
+        for name, (centre, yaw) in start.placements.items():
+            self.simulation.place(name, centre, yaw)
+        state = self.robot.reset(start.x, start.y, self.scene.ground_height(start.x, start.y), start.yaw)
+        self.task.begin(state)
+        for sensor in self.sensors:
+            sensor.reset(self.scene, self.np_random)
+        self._elapsed_substeps = 0
+        info = {"is_success": False, "position": np.array((state.x, state.y), dtype=np.float32)}
+        return self._observation(), info
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """
+        Hold an action for one decision period, or until the episode ends.
+
+        :param action: numbers in the action space; those beyond its bounds are clipped
+        :raises ValueError: if the action has another shape or is not finite
+        """
+        task, robot = self.task, self.robot
+        robot.command(task.command(self._checked(action), robot.state))
+        contacts = 0
+        outcome = Outcome.RUNNING
+        for _ in self._substeps:
+            state = robot.substep()
+            self._elapsed_substeps += 1
+            contacts += state.in_contact
+            outcome = task.outcome(state)
+            if outcome is not Outcome.RUNNING:
+                break
+        time_left = max(0.0, 1.0 - self._elapsed_substeps / self._substeps_in_limit)
+        terms = task.reward_terms(state, contacts * robot.substep_period, time_left, outcome)
+        info = {
+            "is_success": outcome is Outcome.SUCCESS,
+            "position": np.array((state.x, state.y), dtype=np.float32),
+            "reward_terms": terms,
+        }
+        if self.render_mode == "human":
+            time.sleep(self.decision_period)
+        return self._observation(), sum(terms.values()), outcome is not Outcome.RUNNING, False, info
+
+    def _checked(self, action: np.ndarray) -> list[float]:
+        """The action as floats within [-1, 1]."""
+        array = np.asarray(action, dtype=np.float64)
+        if array.shape != self._action_shape:
+            raise ValueError(f"An action must have shape {self._action_shape}, got {array.shape}.")
+        values = array.tolist()
+        if not all(map(math.isfinite, values)):
+            raise ValueError(f"An action must be finite, got {values}.")
+        return [max(-1.0, min(1.0, value)) for value in values]
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        state = self.robot.state
+        observation = {"common": self.task.common(state), "privileged": self.task.privileged()}
+        if self.sensors:
+            observation["target"] = self.sensors[0].read(state)
+        return observation
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        Take a picture, uint8 ``(height, width, 3)``; None unless ``render_mode="rgb_array"`` (a window draws itself).
+        """
+        if self.render_mode != "rgb_array":
+            return None
+        if self.view == "top":
+            return self.simulation.picture(self.task.camera, *self.task.picture_size)
+        state = self.robot.state
+        return self.simulation.picture(Camera.following((state.x, state.y, state.z), state.yaw), *_FOLLOWING_SIZE)
+
+    def close(self) -> None:
+        """Close the simulation; a second call does nothing."""
+        self.simulation.close()

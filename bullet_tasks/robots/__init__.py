@@ -1,0 +1,1 @@
+"""Robots as a task sees them: a state, a command, a substep."""

@@ -1,0 +1,5 @@
+"""Sensors: what a robot can perceive of the scene; their readings are the ``target`` observation."""
+
+from bullet_tasks.sensors.base import Sensor
+
+__all__ = ["Sensor"]

@@ -1,0 +1,1 @@
+"""Tasks: geometry, goal, rewards, success and termination, one file each."""

@@ -1,0 +1,136 @@
+"""What the goal-finding tasks of the quadruped share: observation of the pose, heading action, rewards and ends."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from gymnasium import spaces
+
+from bullet_tasks.robots.base import RobotState
+from bullet_tasks.robots.quadruped import WALKING_SPEED, QuadrupedCommand
+from bullet_tasks.tasks.base import Outcome, Task
+
+POSITION_SCALE = 8.0
+"""Positions are observed in units of this length, m (the authors' release)."""
+FALL_HEIGHT = -0.25
+"""A robot over ground lower than this has fallen, m (the authors' release)."""
+
+
+@dataclass(frozen=True)
+class NavigationReward:
+    """
+    Reward weights, the same for all tasks of the authors' release (facts, section 4.2).
+
+    :param goal_progress: per m by which the distance to the goal decreases
+    :param heading_progress: per rad by which the absolute heading error to the goal decreases
+    :param collision: per s of contact (the release: -0.06 per 20 ms)
+    :param goal_bonus: once, at the goal
+    :param time_bonus: once, at the goal, times the fraction of the episode's time that is left
+    """
+
+    goal_progress: float = 4.0
+    heading_progress: float = 2.0
+    collision: float = -3.0
+    goal_bonus: float = 4.0
+    time_bonus: float = 2.0
+
+
+class NavigationTask(Task):
+    """
+    Walk at constant speed to a goal on a platform, steering by heading.
+
+    A subclass sets ``scene`` and draws ``goal`` in ``reset``.
+
+    :param decision_period: s
+    :param time_limit: s
+    :param goal_radius: the base's centre within this distance of the goal has reached it, m
+    :param reward: weights
+    :raises ValueError: if a time or the radius is not positive, or the periods do not fit into the time limit
+    """
+
+    def __init__(self, decision_period: float, time_limit: float, goal_radius: float, reward: NavigationReward) -> None:
+        for name, value in (("decision_period", decision_period), ("time_limit", time_limit), ("goal_radius", goal_radius)):
+            if not (value > 0.0 and math.isfinite(value)):
+                raise ValueError(f"`{name}` must be positive and finite, got {value}.")
+        if decision_period > time_limit:
+            raise ValueError(f"`decision_period` ({decision_period} s) must not exceed `time_limit` ({time_limit} s).")
+        self.decision_period = decision_period
+        self.time_limit = time_limit
+        self.goal_radius = goal_radius
+        self.reward = reward
+        self.goal = (0.0, 0.0)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.common_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self._distance = 0.0
+        self._heading_error = 0.0
+
+    @abstractmethod
+    def privileged(self) -> np.ndarray:
+        """What only training knows in this episode (see base class)."""
+
+    def begin(self, state: RobotState) -> None:
+        """
+        Measure distance and heading error at the start (see base class).
+
+        :param state: of the robot
+        """
+        self._distance, self._heading_error = self._to_goal(state)
+
+    def _to_goal(self, state: RobotState) -> tuple[float, float]:
+        """Distance (m) and absolute heading error (rad, at most pi) to the goal."""
+        dx, dy = self.goal[0] - state.x, self.goal[1] - state.y
+        return math.hypot(dx, dy), abs(math.remainder(math.atan2(dy, dx) - state.yaw, math.tau))
+
+    def command(self, action: Sequence[float], state: RobotState) -> QuadrupedCommand:
+        """
+        Turn by up to half a turn either way, always walking (see base class).
+
+        :param action: turn in units of pi rad, ``(1,)``
+        :param state: of the robot, now
+        """
+        return QuadrupedCommand(WALKING_SPEED, state.yaw + math.pi * action[0])
+
+    def outcome(self, state: RobotState) -> Outcome:
+        """
+        Success in the goal circle, failure over a drop (see base class).
+
+        :param state: of the robot
+        """
+        x, y = state.x, state.y
+        if math.hypot(self.goal[0] - x, self.goal[1] - y) <= self.goal_radius:
+            return Outcome.SUCCESS
+        # Floors stay where they are, so the scene of any episode will do.
+        if self.scene.ground_height(x, y) < FALL_HEIGHT:
+            return Outcome.FAILURE
+        return Outcome.RUNNING
+
+    def reward_terms(self, state: RobotState, contact_time: float, time_left: float, outcome: Outcome) -> dict[str, float]:
+        """
+        Progress, collisions and bonus (see base class and ``NavigationReward``).
+
+        :param state: of the robot, after the decision
+        :param contact_time: s
+        :param time_left: fraction of the episode's time that is left
+        :param outcome: how the episode stands
+        """
+        reward = self.reward
+        distance, heading_error = self._to_goal(state)
+        terms = {
+            "goal_progress": reward.goal_progress * (self._distance - distance),
+            "heading_progress": reward.heading_progress * (self._heading_error - heading_error),
+            "collision": reward.collision * contact_time,
+            "goal_bonus": reward.goal_bonus + reward.time_bonus * time_left if outcome is Outcome.SUCCESS else 0.0,
+        }
+        self._distance, self._heading_error = distance, heading_error
+        return terms
+
+    def common(self, state: RobotState) -> np.ndarray:
+        """
+        Pose of the base: x and y in units of 8 m, cosine and sine of the yaw; float32 ``(4,)``.
+
+        :param state: of the robot
+        """
+        pose = (state.x / POSITION_SCALE, state.y / POSITION_SCALE, math.cos(state.yaw), math.sin(state.yaw))
+        return np.array(pose, dtype=np.float32)

@@ -1,0 +1,5 @@
+"""The methods that USPL is compared with, as thin variations of the same parts."""
+
+from sb3_uspl.baselines.rma import RMA
+
+__all__ = ["RMA"]

@@ -1,0 +1,243 @@
+"""Where experience lives: PPO's rollout buffer, and the episodes that the observation encoder learns from."""
+
+from collections import deque
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
+
+from sb3_uspl.encoder import Tokens
+from sb3_uspl.observations import COMMON, EPISODE_STEP, PREVIOUS_ACTION, PRIVILEGED, TARGET, TRUTH, policy_observation_space
+
+
+@dataclass
+class Episode:
+    """
+    One finished episode, as the encoder needs it.
+
+    :param arrays: encoder inputs and truth by key, each ``(length, ...)``
+    :param mismatched: whether the policy acted on another environment's privileged observation
+    """
+
+    arrays: dict[str, np.ndarray]
+    mismatched: bool
+
+    def __len__(self) -> int:
+        return len(self.arrays[TRUTH])
+
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in self.arrays.values())
+
+
+class EpisodeBatch(NamedTuple):
+    """Episodes padded at the end to a common length."""
+
+    tokens: Tokens
+    """Encoder inputs, ``(n_episodes, length, ...)``."""
+    truth: th.Tensor
+    """Privileged observations, ``(n_episodes, length, n_privileged)``."""
+    lengths: th.Tensor
+    """True lengths, ``(n_episodes,)``."""
+
+    @property
+    def mask(self) -> th.Tensor:
+        """Which tokens are real, ``(n_episodes, length)``."""
+        return th.arange(self.truth.shape[1], device=self.lengths.device)[None] < self.lengths[:, None]
+
+
+class EpisodeReplayBuffer:
+    """
+    Whole episodes for the encoder: those running, those that ended in this iteration, and a replay of older ones.
+
+    The replay keeps the observations in their own dtype, once, within a budget of bytes; the oldest episodes go first.
+
+    :param observation_space: the environment's observation space (the contract)
+    :param n_action: number of encoded action values
+    :param n_envs: number of environments
+    :param n_mismatched: the last ``n_mismatched`` environments are mismatched
+    :param context_length: longest episode, in decisions
+    :param max_bytes: budget of the replay
+    :param keep: "mismatched" replays mismatched episodes only, as the authors' release does (all, if none is mismatched):
+        in them the behaviour says nothing about the truth. "all" replays every episode, as the paper's Alg. 1 says.
+    :param seed: of the sampling
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        n_action: int,
+        n_envs: int,
+        n_mismatched: int,
+        context_length: int,
+        max_bytes: int,
+        keep: str = "mismatched",
+        seed: int | None = None,
+    ):
+        if keep not in ("mismatched", "all"):
+            raise ValueError(f"replay='{keep}': replay either 'mismatched' or 'all' episodes.")
+        self.n_envs, self.n_mismatched = n_envs, n_mismatched
+        self.context_length, self.max_bytes, self.keep = context_length, max_bytes, keep
+        self.rng = np.random.default_rng(seed)
+        self._spec = {
+            COMMON: (observation_space[COMMON].shape, np.float32),
+            PREVIOUS_ACTION: ((n_action,), np.float32),
+            TRUTH: (observation_space[PRIVILEGED].shape, np.float32),
+        }
+        if TARGET in observation_space.spaces:
+            self._spec[TARGET] = (observation_space[TARGET].shape, observation_space[TARGET].dtype)  # type: ignore[assignment]
+        self.replay: deque[Episode] = deque()
+        self.fresh: list[Episode] = []
+        self.nbytes = 0
+        self.forget_running()
+
+    def forget_running(self) -> None:
+        """Drop the episodes that have not ended, because the environments were reset."""
+        self._capacity = min(64, self.context_length)
+        self.running = {
+            key: np.zeros((self.n_envs, self._capacity, *shape), dtype) for key, (shape, dtype) in self._spec.items()
+        }
+        self.lengths = np.zeros(self.n_envs, dtype=np.int64)
+
+    def add(self, obs: dict[str, np.ndarray]) -> None:
+        """
+        Append one decision to every running episode; an environment at step 0 first closes the episode before.
+
+        :param obs: what :class:`~sb3_uspl.wrappers.UncertaintyVecWrapper` returns, ``(n_envs, ...)`` by key
+        """
+        step = obs[EPISODE_STEP]
+        for env in np.flatnonzero((step == 0) & (self.lengths > 0)):
+            arrays = {key: array[env, : self.lengths[env]].copy() for key, array in self.running.items()}
+            self.fresh.append(Episode(arrays, mismatched=bool(env >= self.n_envs - self.n_mismatched)))
+        self.lengths[step == 0] = 0
+        # A callback that stops training skips a decision; what is left of such an episode has a gap and is not used.
+        whole = step == self.lengths
+        self.lengths[~whole] = 0
+        rows = np.flatnonzero(whole)
+        if len(rows) == 0:
+            return
+        self._grow(int(step[rows].max()) + 1)
+        for key, array in self.running.items():
+            array[rows, step[rows]] = obs[key][rows]
+        self.lengths[rows] += 1
+
+    def end_iteration(self) -> None:
+        """Move this iteration's episodes to the replay and drop the oldest ones beyond the budget."""
+        for episode in self.fresh:
+            if self.keep == "all" or episode.mismatched or self.n_mismatched == 0:
+                self.replay.append(episode)
+                self.nbytes += episode.nbytes
+        self.fresh = []
+        while self.nbytes > self.max_bytes:
+            self.nbytes -= self.replay.popleft().nbytes
+
+    def sample(self, n_tokens: int, device: th.device | str = "cpu") -> EpisodeBatch | None:
+        """
+        Whole episodes, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one if the other is empty.
+
+        :param n_tokens: about how many decisions
+        :param device: of the tensors
+        :return: padded batch; None before the first episode has ended
+        """
+        sources = [source for source in (self.fresh, self.replay) if source]
+        if not sources:
+            return None
+        episodes: list[Episode] = []
+        for source in sources:
+            count = 0
+            while count < n_tokens / len(sources):
+                episodes.append(source[int(self.rng.integers(len(source)))])
+                count += len(episodes[-1])
+        return self.collate(episodes, device)
+
+    def running_tokens(self, device: th.device | str = "cpu") -> tuple[Tokens, th.Tensor]:
+        """
+        The past of the running episodes, without the current observation.
+
+        :param device: of the tensors
+        :return: tokens ``(n_envs, longest, ...)`` and lengths ``(n_envs,)``
+        """
+        longest = max(int(self.lengths.max()), 1)
+        tokens = {
+            key: th.as_tensor(array[:, :longest], device=device) for key, array in self.running.items() if key != TRUTH
+        }
+        return tokens, th.as_tensor(self.lengths, device=device)
+
+    def collate(self, episodes: Sequence[Episode], device: th.device | str = "cpu") -> EpisodeBatch:
+        """
+        :param episodes: episodes of any length
+        :param device: of the tensors
+        :return: padded batch
+        """
+        lengths = np.array([len(episode) for episode in episodes])
+        padded = {}
+        for key, (shape, dtype) in self._spec.items():
+            array = np.zeros((len(episodes), lengths.max(), *shape), dtype)
+            for row, episode in enumerate(episodes):
+                array[row, : len(episode)] = episode.arrays[key]
+            padded[key] = th.as_tensor(array, device=device)
+        truth = padded.pop(TRUTH)
+        return EpisodeBatch(padded, truth, th.as_tensor(lengths, device=device))
+
+    def _grow(self, capacity: int) -> None:
+        if capacity > self.context_length:
+            raise ValueError(
+                f"An episode is longer than the encoder's context of {self.context_length} decisions. "
+                "Raise `context_length`, or limit the environment with gymnasium.wrappers.TimeLimit."
+            )
+        if capacity > self._capacity:
+            extra = min(max(capacity, 2 * self._capacity), self.context_length) - self._capacity
+            for key, array in self.running.items():
+                padding = [(0, 0)] * array.ndim
+                padding[1] = (0, extra)
+                self.running[key] = np.pad(array, padding)
+            self._capacity += extra
+
+
+class USPLRolloutBuffer(DictRolloutBuffer):
+    """
+    PPO's rollout buffer for what actor and critic saw, which also feeds the encoder's :class:`EpisodeReplayBuffer`.
+
+    The last ``n_mismatched`` environments acted on wrong privileged observations: they feed the encoder, never PPO's loss.
+
+    :param buffer_size: decisions per environment and rollout
+    :param observation_space: the environment's observation space (the contract)
+    :param action_space: action space
+    :param n_mismatched: number of mismatched environments
+    :param kwargs: as for ``DictRolloutBuffer``
+    """
+
+    def __init__(
+        self, buffer_size: int, observation_space: spaces.Dict, action_space: spaces.Space, n_mismatched: int = 0, **kwargs: Any
+    ):
+        self.n_mismatched = n_mismatched
+        self.n_collecting = kwargs.get("n_envs", 1)
+        self.episodes: EpisodeReplayBuffer | None = None
+        super().__init__(buffer_size, policy_observation_space(observation_space), action_space, **kwargs)
+
+    def reset(self) -> None:
+        self.n_envs = self.n_collecting
+        super().reset()
+
+    def add(self, obs: dict[str, np.ndarray], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        """
+        :param obs: what :class:`~sb3_uspl.wrappers.UncertaintyVecWrapper` returned
+        :param args: as for ``DictRolloutBuffer.add``
+        :param kwargs: as for ``DictRolloutBuffer.add``
+        """
+        super().add(obs, *args, **kwargs)
+        if self.episodes is not None:
+            self.episodes.add(obs)
+
+    def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
+        if not self.generator_ready and self.n_mismatched > 0:
+            self.n_envs = self.n_collecting - self.n_mismatched
+            self.observations = {key: array[:, : self.n_envs] for key, array in self.observations.items()}
+            for name in ("actions", "values", "log_probs", "advantages", "returns"):
+                setattr(self, name, getattr(self, name)[:, : self.n_envs])
+        yield from super().get(batch_size)

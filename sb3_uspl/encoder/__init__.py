@@ -1,0 +1,25 @@
+"""Observation encoder: features (MLP, CNN), memory (GRU, Transformer with KV cache), belief head (mean, std)."""
+
+from sb3_uspl.encoder.encoder import MAX_STD, MIN_STD, PRESETS, Belief, ObservationEncoder, gaussian_nll, soft_clamp
+from sb3_uspl.encoder.features import RunningNormalizer, TokenFeatures, Tokens
+from sb3_uspl.encoder.memory import MEMORIES, GRUMemory, Memory, MemoryState, TransformerMemory, reset_rows, take_rows
+
+__all__ = [
+    "MAX_STD",
+    "MEMORIES",
+    "MIN_STD",
+    "PRESETS",
+    "Belief",
+    "GRUMemory",
+    "Memory",
+    "MemoryState",
+    "ObservationEncoder",
+    "RunningNormalizer",
+    "TokenFeatures",
+    "Tokens",
+    "TransformerMemory",
+    "gaussian_nll",
+    "reset_rows",
+    "soft_clamp",
+    "take_rows",
+]

@@ -1,0 +1,145 @@
+"""The observation encoder E_s: a belief about the privileged observation from the history of what is seen (Sec. 3.1)."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+from torch import nn
+
+from sb3_uspl.encoder.features import TokenFeatures, Tokens, mlp
+from sb3_uspl.encoder.memory import MEMORIES, MemoryState
+from sb3_uspl.observations import PRIVILEGED
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # Trains on two CPU cores.
+    "small": dict(
+        hidden=(128,), trunk=(128,), embedding=(128,), head=(), memory_kwargs={"gru": {}, "transformer": {}}
+    ),
+    # Sizes of App. C.3.3 (non-image; the image branch is added when the target is an image).
+    "paper": dict(
+        hidden=(512, 256, 128),
+        trunk=(1024, 512, 256),
+        embedding=(256, 128),
+        head=(512, 256),
+        memory_kwargs={"gru": {}, "transformer": {"n_heads": 16, "head_width": 64}},
+    ),
+}  # fmt: skip
+
+MIN_STD, MAX_STD = 0.005, 1.0
+"""Range of the predicted standard deviation (release: log-std softly clamped to [ln 0.005, 0])."""
+
+
+class Belief(NamedTuple):
+    """Gaussian over the privileged observation; both ``(..., n_privileged)``."""
+
+    mean: th.Tensor
+    log_std: th.Tensor
+
+    @property
+    def std(self) -> th.Tensor:
+        """Standard deviation, between ``MIN_STD`` and ``MAX_STD``."""
+        return self.log_std.exp()
+
+
+def soft_clamp(x: th.Tensor, low: float, high: float) -> th.Tensor:
+    """
+    Smooth limits that never stop the gradient: softplus towards both ends.
+
+    :param x: any value
+    :param low: lower limit
+    :param high: upper limit
+    :return: value in (low, high)
+    """
+    x = high - F.softplus(high - x)
+    return low + F.softplus(x - low)
+
+
+def gaussian_nll(belief: Belief, truth: th.Tensor, mask: th.Tensor) -> th.Tensor:
+    """
+    Negative log-likelihood of the truth, Eq. 1: summed over privileged dimensions, averaged over the tokens that count.
+
+    :param belief: predicted Gaussians, ``(n_episodes, length, n_privileged)``
+    :param truth: privileged observations, same shape
+    :param mask: which tokens are real, ``(n_episodes, length)``
+    :return: scalar loss
+    """
+    z = (truth - belief.mean) * th.exp(-belief.log_std)
+    nll = (0.5 * z**2 + belief.log_std + 0.5 * math.log(2.0 * math.pi)).sum(-1)
+    return (nll * mask).sum() / mask.sum()
+
+
+class ObservationEncoder(nn.Module):
+    """
+    Token features -> memory over the episode -> mean and log standard deviation.
+
+    :param space: observation space of the environment (the contract)
+    :param n_action: number of encoded action values; the previous action is an input
+    :param preset: "small" or "paper", see ``PRESETS``
+    :param memory: "gru" or "transformer", see ``MEMORIES``
+    :param overrides: replaces single entries of the preset
+    :raises ValueError: for an unknown preset, memory or override
+    """
+
+    def __init__(
+        self,
+        space: spaces.Dict,
+        n_action: int,
+        preset: str = "small",
+        memory: str = "gru",
+        overrides: dict[str, Any] | None = None,
+    ):
+        super().__init__()
+        if preset not in PRESETS or memory not in MEMORIES:
+            raise ValueError(
+                f"encoder='{preset}' with memory='{memory}': the presets are {sorted(PRESETS)}, the memories {sorted(MEMORIES)}."
+            )
+        unknown = set(overrides or {}) - set(PRESETS[preset])
+        if unknown:
+            raise ValueError(f"encoder_kwargs has unknown entries {sorted(unknown)}; it may replace {sorted(PRESETS[preset])}.")
+        sizes = {**PRESETS[preset], **(overrides or {})}
+        n_privileged = space[PRIVILEGED].shape[0]  # type: ignore[index]
+        self.features = TokenFeatures(space, n_action, sizes["hidden"], sizes["trunk"])
+        self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
+        self.embedding = mlp(self.memory.width, sizes["embedding"])
+        if sizes["embedding"]:
+            self.embedding[-1] = nn.Tanh()  # "the final embedding is activated using the Tanh function" (C.3.3)
+        width = sizes["embedding"][-1] if sizes["embedding"] else self.memory.width
+        self.mean = self._head(width, sizes["head"], n_privileged)
+        self.log_std = self._head(width, sizes["head"], n_privileged)
+
+    @staticmethod
+    def _head(n_inputs: int, hidden: tuple[int, ...], n_outputs: int) -> nn.Sequential:
+        # Starting from zero, every belief is N(0, 0.5^2), the state that smoothing starts from.
+        last = nn.Linear(hidden[-1] if hidden else n_inputs, n_outputs)
+        nn.init.normal_(last.weight, std=0.01)
+        nn.init.zeros_(last.bias)
+        return nn.Sequential(*mlp(n_inputs, hidden), last)
+
+    def forward(self, tokens: Tokens, lengths: th.Tensor) -> tuple[Belief, MemoryState]:
+        """
+        Beliefs along whole episodes.
+
+        :param tokens: encoder inputs, ``(n_episodes, length, ...)``, padded at the end
+        :param lengths: true lengths, ``(n_episodes,)``
+        :return: beliefs ``(n_episodes, length, n_privileged)`` and the memory after each episode's last token
+        """
+        memory, state = self.memory(self.features(tokens), lengths)
+        return self._belief(memory), state
+
+    def step(self, tokens: Tokens, state: MemoryState) -> tuple[Belief, MemoryState]:
+        """
+        Beliefs after one more token per environment.
+
+        :param tokens: encoder inputs, ``(n_envs, ...)``
+        :param state: memory state; may be overwritten
+        :return: beliefs ``(n_envs, n_privileged)`` and the next state
+        """
+        memory, state = self.memory.step(self.features(tokens), state)
+        return self._belief(memory), state
+
+    def _belief(self, memory: th.Tensor) -> Belief:
+        embedding = self.embedding(memory)
+        log_std = soft_clamp(self.log_std(embedding), math.log(MIN_STD), math.log(MAX_STD))
+        return Belief(self.mean(embedding), log_std)

@@ -1,0 +1,163 @@
+"""From one decision's observation to one feature vector."""
+
+from collections.abc import Sequence
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from torch import nn
+
+from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, TARGET
+
+Tokens = dict[str, th.Tensor]
+"""Encoder inputs by key (``common``, ``target``, ``previous_action``), each ``(..., *shape of the key)``."""
+
+
+def mlp(n_inputs: int, hidden: Sequence[int]) -> nn.Sequential:
+    """
+    Linear layers, each followed by ELU (App. C.3.3).
+
+    :param n_inputs: number of inputs
+    :param hidden: width of each layer
+    :return: network; the identity without layers
+    """
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(n_inputs, width), nn.ELU()]
+        n_inputs = width
+    return nn.Sequential(*layers)
+
+
+class RunningNormalizer(nn.Module):
+    """
+    Brings each input to zero mean and unit variance with statistics of all the data passed to :meth:`update`.
+
+    Unscaled inputs cost the encoder a factor in learning speed (scandot heights of a few centimetres beside angles).
+
+    :param n_inputs: number of inputs
+    """
+
+    LIMIT = 10.0
+    MIN_STD = 1e-2
+
+    def __init__(self, n_inputs: int):
+        super().__init__()
+        self.mean: th.Tensor
+        self.var: th.Tensor
+        self.count: th.Tensor
+        self.register_buffer("mean", th.zeros(n_inputs))
+        self.register_buffer("var", th.ones(n_inputs))
+        self.register_buffer("count", th.zeros((), dtype=th.float64))
+
+    @th.no_grad()
+    def update(self, x: th.Tensor) -> None:
+        """
+        Merge a batch into the statistics (Chan et al.'s parallel variance).
+
+        :param x: ``(n_samples, n_inputs)``
+        """
+        n = float(len(x))
+        total = float(self.count) + n
+        delta = x.mean(0) - self.mean
+        share = n / total
+        kept = float(self.count) / total
+        self.var.copy_(kept * self.var + share * x.var(0, correction=0) + kept * share * delta**2)
+        self.mean.add_(share * delta)
+        self.count.fill_(total)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: ``(..., n_inputs)``
+        :return: same shape, within +-``LIMIT``
+        """
+        return ((x - self.mean) / self.var.sqrt().clamp(min=self.MIN_STD)).clamp(-self.LIMIT, self.LIMIT)
+
+
+class DepthCNN(nn.Module):
+    """
+    Image features of App. C.3.3: conv 5x5 (32), max-pool 2, conv 3x3 (64), two layers of 128, Tanh.
+
+    :param space: image space ``(channels, height, width)``
+    :param channels: channels of the two convolutions
+    """
+
+    WIDTH = 128
+
+    def __init__(self, space: spaces.Box, channels: tuple[int, int] = (32, 64)):
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(space.shape[0], channels[0], 5),
+            nn.MaxPool2d(2),
+            nn.ELU(),
+            nn.Conv2d(channels[0], channels[1], 3),
+            nn.ELU(),
+            nn.Flatten(),
+        )
+        with th.no_grad():
+            n_flat = self.convolutions(th.zeros(1, *space.shape)).shape[1]
+        self.fully_connected = nn.Sequential(nn.Linear(n_flat, self.WIDTH), nn.ELU(), nn.Linear(self.WIDTH, self.WIDTH), nn.Tanh())
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: ``(n, channels, height, width)``, bytes
+        :return: ``(n, 128)``
+        """
+        return self.fully_connected(self.convolutions(images.float() / 255.0))
+
+
+class TokenFeatures(nn.Module):
+    """
+    Features of one decision: normalised vectors through an MLP each, an image through a CNN, concatenated, then a trunk.
+
+    :param space: observation space of the environment (the contract)
+    :param n_action: number of encoded action values
+    :param hidden: layers for each kind of input
+    :param trunk: layers after the concatenation
+    """
+
+    def __init__(self, space: spaces.Dict, n_action: int, hidden: Sequence[int], trunk: Sequence[int]):
+        super().__init__()
+        common, target = space[COMMON], space.spaces.get(TARGET)
+        assert isinstance(common, spaces.Box)
+        self.common_normalizer = RunningNormalizer(common.shape[0] + n_action)
+        self.common = mlp(common.shape[0] + n_action, hidden)
+        width = hidden[-1]
+        self.has_image = target is not None and is_image_space(target)
+        self.has_vector_target = target is not None and not self.has_image
+        if self.has_image:
+            assert isinstance(target, spaces.Box)
+            self.image = DepthCNN(target)
+            width += DepthCNN.WIDTH
+        if self.has_vector_target:
+            assert isinstance(target, spaces.Box)
+            self.target_normalizer = RunningNormalizer(target.shape[0])
+            self.target = mlp(target.shape[0], hidden)
+            width += hidden[-1]
+        self.trunk = mlp(width, trunk)
+        self.width = trunk[-1] if trunk else width
+
+    def update_normalizers(self, tokens: Tokens) -> None:
+        """
+        :param tokens: a batch of unpadded tokens, ``(n_tokens, ...)``
+        """
+        self.common_normalizer.update(self._common_vector(tokens))
+        if self.has_vector_target:
+            self.target_normalizer.update(tokens[TARGET].float())
+
+    def forward(self, tokens: Tokens) -> th.Tensor:
+        """
+        :param tokens: ``(..., *shape of the key)``
+        :return: ``(..., width)``
+        """
+        parts = [self.common(self.common_normalizer(self._common_vector(tokens)))]
+        if self.has_vector_target:
+            parts.append(self.target(self.target_normalizer(tokens[TARGET].float())))
+        if self.has_image:
+            images = tokens[TARGET]
+            batch = images.shape[:-3]
+            parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, -1))
+        return self.trunk(th.cat(parts, dim=-1))
+
+    @staticmethod
+    def _common_vector(tokens: Tokens) -> th.Tensor:
+        return th.cat([tokens[COMMON].float(), tokens[PREVIOUS_ACTION]], dim=-1)

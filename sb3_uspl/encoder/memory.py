@@ -1,0 +1,199 @@
+"""The observation encoder's memory: one interface, two implementations, registered by name in ``MEMORIES``."""
+
+from abc import ABC, abstractmethod
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+MemoryState = tuple[th.Tensor, ...]
+"""What a memory carries from one decision to the next; every tensor has the environments as its first axis."""
+
+
+def reset_rows(state: MemoryState, rows: th.Tensor) -> None:
+    """
+    Forget everything in some environments, in place. All-zero is every memory's initial state.
+
+    :param state: memory state
+    :param rows: boolean mask or indices of environments
+    """
+    for tensor in state:
+        tensor[rows] = 0
+
+
+def take_rows(state: MemoryState, rows: th.Tensor) -> MemoryState:
+    """
+    Independent copy of some environments' state.
+
+    :param state: memory state
+    :param rows: indices of environments
+    :return: state of those environments
+    """
+    return tuple(tensor[rows] for tensor in state)
+
+
+class Memory(nn.Module, ABC):
+    """
+    Turns the features seen so far in an episode into one vector per decision.
+
+    ``forward`` over a whole episode and ``step`` over its tokens one by one give the same outputs.
+
+    :param width: number of features of input and output
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.width = width
+
+    @abstractmethod
+    def initial_state(self, n_envs: int) -> MemoryState:
+        """
+        :param n_envs: number of environments
+        :return: all-zero state
+        """
+
+    @abstractmethod
+    def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        """
+        :param features: whole episodes, ``(n_episodes, length, width)``, padded at the end
+        :param lengths: true lengths, ``(n_episodes,)``; 0 is allowed
+        :return: outputs, same shape as the features, and the state after each episode's last token
+        """
+
+    @abstractmethod
+    def step(self, features: th.Tensor, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
+        """
+        :param features: one token per environment, ``(n_envs, width)``
+        :param state: memory state; may be overwritten
+        :return: outputs ``(n_envs, width)`` and the next state
+        """
+
+
+class GRUMemory(Memory):
+    """
+    Gated recurrent unit. One token costs the same at any position.
+
+    :param width: number of features of input and output
+    """
+
+    def __init__(self, width: int):
+        super().__init__(width)
+        self.gru = nn.GRU(width, width, batch_first=True)
+
+    def initial_state(self, n_envs: int) -> MemoryState:
+        return (th.zeros(n_envs, self.width, device=self.gru.weight_hh_l0.device),)
+
+    def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        outputs, _ = self.gru(features)
+        rows = th.arange(len(features), device=features.device)
+        last = outputs[rows, (lengths - 1).clamp(min=0)]
+        # The output of a one-layer GRU is its state; an empty episode leaves the initial state.
+        return outputs, (th.where(lengths[:, None] > 0, last, th.zeros_like(last)),)
+
+    def step(self, features: th.Tensor, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
+        outputs, hidden = self.gru(features[:, None], state[0][None].contiguous())
+        return outputs[:, 0], (hidden[0],)
+
+
+class TransformerMemory(Memory):
+    """
+    Causal Transformer with a cache of keys and values (paper, App. C.3.3), pre-norm with RMSNorm as in the release.
+
+    Positions enter as ALiBi, a penalty on attention that grows with distance, rather than as learned vectors: an episode may
+    be longer than any seen in training, cached keys stay valid as the episode grows, and there is no table to size.
+
+    :param width: number of features of input and output
+    :param n_heads: attention heads
+    :param head_width: features per head
+    :param n_layers: Transformer blocks
+    :param dropout: share of dropped residual features while training
+    """
+
+    CACHE_BLOCK = 64
+    """The cache grows by doubling from this many tokens."""
+
+    def __init__(self, width: int, n_heads: int = 4, head_width: int = 32, n_layers: int = 1, dropout: float = 0.0):
+        super().__init__(width)
+        self.n_heads, self.head_width, self.n_layers = n_heads, head_width, n_layers
+        self.blocks = nn.ModuleList(_Block(width, n_heads, head_width, dropout) for _ in range(n_layers))
+        self.norm = nn.RMSNorm(width)
+        self.out = nn.Linear(width, width)
+        slopes = 2.0 ** (-8.0 * th.arange(1, n_heads + 1) / n_heads)
+        self.register_buffer("slopes", slopes, persistent=False)
+        self.slopes: th.Tensor
+
+    def initial_state(self, n_envs: int) -> MemoryState:
+        shape = (n_envs, self.n_layers, self.n_heads, self.CACHE_BLOCK, self.head_width)
+        device = self.slopes.device
+        return (
+            th.zeros(shape, device=device),
+            th.zeros(shape, device=device),
+            th.zeros(n_envs, dtype=th.long, device=device),
+        )
+
+    def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        n_tokens = features.shape[1]
+        position = th.arange(n_tokens, device=features.device)
+        bias = self._bias(position[:, None], position[None, :])
+        keys, values = [], []
+        for block in self.blocks:
+            q, k, v = block.project(features)
+            features = block.finish(features, F.scaled_dot_product_attention(q, k, v, attn_mask=bias))
+            keys.append(k)
+            values.append(v)
+        capacity = self.CACHE_BLOCK
+        while capacity < n_tokens:
+            capacity *= 2
+        padding = (0, 0, 0, capacity - n_tokens)
+        state = (F.pad(th.stack(keys, 1).detach(), padding), F.pad(th.stack(values, 1).detach(), padding), lengths.clone())
+        return self.out(self.norm(features)), state
+
+    def step(self, features: th.Tensor, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
+        keys, values, length = state
+        n_tokens = int(length.max()) + 1
+        if n_tokens > keys.shape[3]:
+            padding = (0, 0, 0, keys.shape[3])
+            keys, values = F.pad(keys, padding), F.pad(values, padding)
+        rows = th.arange(len(features), device=features.device)
+        position = th.arange(n_tokens, device=features.device)
+        bias = self._bias(length[:, None, None], position[None, None, :]).transpose(0, 1)
+        features = features[:, None]
+        for index, block in enumerate(self.blocks):
+            q, k, v = block.project(features)
+            keys[rows, index, :, length] = k[:, :, 0]
+            values[rows, index, :, length] = v[:, :, 0]
+            attended = F.scaled_dot_product_attention(q, keys[:, index, :, :n_tokens], values[:, index, :, :n_tokens], attn_mask=bias)
+            features = block.finish(features, attended)
+        return self.out(self.norm(features))[:, 0], (keys, values, length + 1)
+
+    def _bias(self, query: th.Tensor, key: th.Tensor) -> th.Tensor:
+        """ALiBi penalty, minus infinity for the future; ``(n_heads, *broadcast(query, key))``."""
+        distance = (query - key)[None]
+        slopes = self.slopes.view(-1, *[1] * (distance.dim() - 1))
+        return th.where(distance >= 0, -slopes * distance, -th.inf)
+
+
+class _Block(nn.Module):
+    """One pre-norm Transformer block without its attention product, which differs between ``forward`` and ``step``."""
+
+    def __init__(self, width: int, n_heads: int, head_width: int, dropout: float):
+        super().__init__()
+        self.n_heads = n_heads
+        self.attention_norm = nn.RMSNorm(width)
+        self.qkv = nn.Linear(width, 3 * n_heads * head_width)
+        self.merge = nn.Linear(n_heads * head_width, width)
+        self.mlp = nn.Sequential(nn.RMSNorm(width), nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
+        self.dropout = nn.Dropout(dropout)
+
+    def project(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Queries, keys and values, each ``(n, n_heads, n_tokens, head_width)``."""
+        qkv = self.qkv(self.attention_norm(features)).unflatten(-1, (3, self.n_heads, -1))
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        return q, k, v
+
+    def finish(self, features: th.Tensor, attended: th.Tensor) -> th.Tensor:
+        features = features + self.dropout(self.merge(attended.transpose(1, 2).flatten(2)))
+        return features + self.dropout(self.mlp(features))
+
+
+MEMORIES: dict[str, type[Memory]] = {"gru": GRUMemory, "transformer": TransformerMemory}

@@ -1,0 +1,9 @@
+"""Small environments in plain numpy, to try the method in a minute without a simulator."""
+
+import gymnasium as gym
+
+from sb3_uspl.envs.target_reaching import TargetReachingEnv
+
+gym.register("TargetReaching-v0", entry_point=TargetReachingEnv, max_episode_steps=TargetReachingEnv.MAX_STEPS)
+
+__all__ = ["TargetReachingEnv"]

@@ -1,0 +1,182 @@
+"""The observation contract: which part of an observation may be used when.
+
+=============== =============================== ==========================================
+key             space                           seen by
+=============== =============================== ==========================================
+``common``      ``Box (n_common,)``             actor, critic, encoder; also at deployment
+``target``      ``Box (n_target,)`` or image    encoder only; also at deployment (optional key)
+``privileged``  ``Box (n_privileged,)``         blurred by the actor, exactly by the critic; training only
+=============== =============================== ==========================================
+
+While a rollout is collected, :class:`~sb3_uspl.wrappers.UncertaintyVecWrapper` adds the keys ``truth``, ``uncertainty`` and
+``belief`` (the encoder's mean); ``privileged`` then is the blurred observation.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+
+COMMON, TARGET, PRIVILEGED = "common", "target", "privileged"
+TRUTH, UNCERTAINTY, BELIEF = "truth", "uncertainty", "belief"
+PREVIOUS_ACTION, EPISODE_STEP = "previous_action", "episode_step"
+
+POLICY_KEYS = (COMMON, PRIVILEGED, TRUTH, UNCERTAINTY, BELIEF)
+"""What PPO's networks and rollout buffer hold; the encoder's inputs (``target``, previous actions) never reach them."""
+
+
+def check_observation_space(space: spaces.Space) -> spaces.Dict:
+    """
+    Check that a space follows the observation contract.
+
+    :param space: the environment's observation space
+    :return: the same space
+    :raises ValueError: naming what was given, what is expected and what to do
+    """
+    advice = (
+        "USPL needs a gymnasium.spaces.Dict with the keys 'common' and 'privileged' (and 'target', optional). "
+        "Wrap your environment in sb3_uspl.PrivilegedObservation to name which part of its observation is privileged."
+    )
+    if not isinstance(space, spaces.Dict):
+        raise ValueError(f"The observation space is {space}. {advice}")
+    keys = set(space.spaces)
+    if not {COMMON, PRIVILEGED} <= keys or not keys <= {COMMON, PRIVILEGED, TARGET}:
+        raise ValueError(f"The observation space has the keys {sorted(keys)}. {advice}")
+    for key, part in space.spaces.items():
+        if not isinstance(part, spaces.Box):
+            raise ValueError(f"The space of '{key}' is {part}; it must be a Box (nested Dicts: flatten them first).")
+        if len(part.shape) != 1 and not (key == TARGET and is_image_space(part)):
+            allowed = "one-dimensional, or a uint8 image of shape (channels, height, width)" if key == TARGET else "one-dimensional"
+            raise ValueError(f"The space of '{key}' has the shape {part.shape} and dtype {part.dtype}; it must be {allowed}.")
+        if part.shape[0] == 0:
+            raise ValueError(f"The space of '{key}' is empty; it must have at least one dimension.")
+    return space
+
+
+def check_finite(observation: Mapping[str, np.ndarray]) -> None:
+    """
+    Refuse NaN and infinite observations, which would silently poison the encoder's running statistics.
+
+    :param observation: arrays by key
+    :raises ValueError: naming the key and the first bad index
+    """
+    for key, value in observation.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            index = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
+            raise ValueError(
+                f"Observation '{key}' holds {value[index]} at index {index}. Every observation must be finite: "
+                "check the environment (gymnasium.wrappers or stable_baselines3's VecCheckNan help to find the step)."
+            )
+
+
+def policy_observation_space(space: spaces.Dict) -> spaces.Dict:
+    """
+    What the actor and the critic see during a rollout.
+
+    :param space: the environment's observation space (the contract)
+    :return: space with the keys ``POLICY_KEYS``
+    """
+    privileged = space[PRIVILEGED]
+    assert isinstance(privileged, spaces.Box) and isinstance(space[COMMON], spaces.Box)
+    unbounded = spaces.Box(-np.inf, np.inf, privileged.shape, np.float32)
+    return spaces.Dict(
+        {
+            COMMON: space[COMMON],
+            PRIVILEGED: unbounded,
+            TRUTH: unbounded,
+            UNCERTAINTY: spaces.Box(0.0, 1.0, privileged.shape, np.float32),
+            BELIEF: unbounded,
+        }
+    )
+
+
+class PrivilegedObservation(gym.ObservationWrapper):
+    """
+    Turn an environment of your own into one that follows the observation contract.
+
+    With a flat ``Box`` observation, name the *indices* that are privileged (and those only the encoder may see); the rest is
+    common. With a flat ``Dict`` of one-dimensional boxes, name the *keys*; several keys are concatenated in the order given.
+
+    USPL's constants assume that a guess without any information about the privileged values has a standard deviation of
+    about 0.2-0.25 (paper, Eq. 2 with ``C_min = log 0.2``): ``scale`` and ``offset`` bring them there,
+    ``privileged = (raw - offset) * scale``.
+
+    :param env: environment with a flat ``Box`` or ``Dict`` observation space
+    :param privileged: indices or keys of the privileged part
+    :param target: indices or keys that only the encoder sees (optional); one key may be an image
+    :param scale: factor on the privileged part, a number or one per dimension
+    :param offset: subtracted from the privileged part before scaling
+    :raises ValueError: if an index or key does not exist, is named twice or nothing is left as common observation
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        privileged: Sequence[int] | Sequence[str],
+        target: Sequence[int] | Sequence[str] = (),
+        scale: float | Sequence[float] = 1.0,
+        offset: float | Sequence[float] = 0.0,
+    ):
+        super().__init__(env)
+        space = env.observation_space
+        if isinstance(space, spaces.Box) and len(space.shape) == 1:
+            available: list[Any] = list(range(space.shape[0]))
+        elif isinstance(space, spaces.Dict) and all(isinstance(part, spaces.Box) for part in space.values()):
+            available = list(space.spaces)
+        else:
+            raise ValueError(f"The observation space is {space}; PrivilegedObservation takes a one-dimensional Box or a flat Dict.")
+        named = [*privileged, *target]
+        unknown = [name for name in named if name not in available]
+        if unknown or len(set(named)) != len(named) or not privileged:
+            raise ValueError(
+                f"privileged={list(privileged)}, target={list(target)}: name at least one privileged part, and each part once, "
+                f"out of {available}."
+            )
+        common = [name for name in available if name not in named]
+        if not common:
+            raise ValueError("Every part of the observation is privileged or target; at least one must stay common.")
+        self._parts: dict[str, list[Any]] = {COMMON: common, PRIVILEGED: list(privileged)}
+        if target:
+            self._parts[TARGET] = list(target)
+        self._scale = np.asarray(scale, dtype=np.float32)
+        self._offset = np.asarray(offset, dtype=np.float32)
+        self.observation_space = spaces.Dict({key: self._part_space(key) for key in self._parts})
+        check_observation_space(self.observation_space)
+
+    def observation(self, observation: Any) -> dict[str, np.ndarray]:
+        """
+        :param observation: the wrapped environment's observation
+        :return: observation under the contract
+        """
+        out = {key: self._select(observation, names) for key, names in self._parts.items()}
+        out[PRIVILEGED] = ((out[PRIVILEGED] - self._offset) * self._scale).astype(np.float32)
+        return out
+
+    @staticmethod
+    def _select(observation: Any, names: list[Any]) -> np.ndarray:
+        if isinstance(observation, dict):
+            parts = [observation[name] for name in names]
+            if len(parts) == 1:
+                return np.asarray(parts[0])
+            return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts])
+        return np.asarray(observation, dtype=np.float32)[names]
+
+    def _part_space(self, key: str) -> spaces.Box:
+        names, space = self._parts[key], self.env.observation_space
+        if isinstance(space, spaces.Dict):
+            boxes = [space[name] for name in names]
+            if len(boxes) == 1 and key != PRIVILEGED:
+                assert isinstance(boxes[0], spaces.Box)
+                return boxes[0]
+            low = np.concatenate([box.low for box in boxes])  # type: ignore[attr-defined]
+            high = np.concatenate([box.high for box in boxes])  # type: ignore[attr-defined]
+        else:
+            assert isinstance(space, spaces.Box)
+            low, high = space.low[names], space.high[names]
+        if key == PRIVILEGED:
+            ends = np.stack([(low - self._offset) * self._scale, (high - self._offset) * self._scale])
+            low, high = ends.min(axis=0), ends.max(axis=0)
+        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)

@@ -1,0 +1,324 @@
+"""Policies: actor and critic for PPO, and the observation encoder that turns the actor into the deployment policy."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import is_vectorized_observation
+from torch import nn
+
+from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, reset_rows
+from sb3_uspl.observations import (
+    BELIEF,
+    COMMON,
+    POLICY_KEYS,
+    PREVIOUS_ACTION,
+    PRIVILEGED,
+    TARGET,
+    TRUTH,
+    UNCERTAINTY,
+    check_finite,
+    check_observation_space,
+    policy_observation_space,
+)
+from sb3_uspl.uncertainty import INITIAL_STD, smooth
+
+
+class DeploymentState(NamedTuple):
+    """What the deployment policy carries from one decision to the next; numpy arrays, environments first."""
+
+    belief_mean: np.ndarray
+    """Mean of the belief after the last observation, ``(n_envs, n_privileged)``."""
+    uncertainty: np.ndarray
+    """Smoothed standard deviation of the belief, ``(n_envs, n_privileged)``."""
+    previous_action: np.ndarray
+    """Encoded last action, ``(n_envs, n_action)``."""
+    memory: tuple[np.ndarray, ...]
+    """The encoder's memory."""
+
+
+class PolicyFeatures(BaseFeaturesExtractor):
+    """
+    Concatenates what the actor or the critic sees, each part brought to about unit scale.
+
+    :param observation_space: with the keys ``POLICY_KEYS``
+    :param privileged_key: ``privileged`` (blurred) for the actor, ``truth`` for the critic
+    :param uncertainty_input: whether the uncertainty is seen
+    :param mean_input: whether the encoder's mean is seen
+    :param privileged_gain: factor on privileged values, whose scale is 0.2-0.25 by contract
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        privileged_key: str,
+        uncertainty_input: bool,
+        mean_input: bool,
+        privileged_gain: float,
+    ):
+        n_privileged = get_flattened_obs_dim(observation_space[PRIVILEGED])
+        n_common = get_flattened_obs_dim(observation_space[COMMON])
+        super().__init__(observation_space, n_common + n_privileged * (1 + uncertainty_input + mean_input))
+        self.privileged_key = privileged_key
+        self.uncertainty_input, self.mean_input = uncertainty_input, mean_input
+        self.privileged_gain = privileged_gain
+
+    def forward(self, obs: dict[str, th.Tensor]) -> th.Tensor:
+        """
+        :param obs: batch by key, ``(n, ...)``
+        :return: ``(n, features_dim)``
+        """
+        parts = [obs[COMMON], obs[self.privileged_key] * self.privileged_gain]
+        if self.uncertainty_input:
+            # Log scale, as the reward transformation: MIN_STD -> -1, INITIAL_STD -> 1.
+            middle = 0.5 * (math.log(INITIAL_STD) + math.log(MIN_STD))
+            half = 0.5 * (math.log(INITIAL_STD) - math.log(MIN_STD))
+            parts.append((th.log(obs[UNCERTAINTY]) - middle) / half)
+        if self.mean_input:
+            parts.append(obs[BELIEF] * self.privileged_gain)
+        return th.cat(parts, dim=1)
+
+
+class USPLPolicy(ActorCriticPolicy):
+    """
+    Privileged policy and observation encoder (Sec. 3.1).
+
+    PPO trains the actor, which sees the common observation, the blurred privileged observation and the uncertainty, and the
+    critic, which sees the true privileged observation. The encoder has its own optimizer and learns by maximum likelihood.
+    :meth:`predict` is the deployment policy: encoder and actor on ``common`` and ``target`` alone.
+
+    :param observation_space: the environment's observation space (the contract)
+    :param action_space: action space
+    :param lr_schedule: learning rate of actor and critic
+    :param net_arch: layers of actor and critic, as in SB3
+    :param activation_fn: their activation (ELU in the paper)
+    :param encoder: preset of the encoder, "small" or "paper" (App. C.3.3)
+    :param memory: the encoder's memory, "gru" or "transformer"
+    :param encoder_kwargs: replaces single entries of the preset
+    :param encoder_learning_rate: initial learning rate of the encoder
+    :param encoder_weight_decay: weight decay of the encoder (Tables 4 and 5)
+    :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)
+    :param mean_input: whether they also see the encoder's mean, as in the authors' release
+    :param privileged_gain: factor that brings privileged values to unit scale
+    :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
+    :param kwargs: further arguments of ``ActorCriticPolicy``
+    :raises ValueError: for a space outside the contract or an unknown preset
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ELU,
+        *,
+        encoder: str = "small",
+        memory: str = "gru",
+        encoder_kwargs: dict[str, Any] | None = None,
+        encoder_learning_rate: float = 1e-3,
+        encoder_weight_decay: float = 0.0,
+        uncertainty_input: bool = True,
+        mean_input: bool = True,
+        privileged_gain: float = 4.0,
+        smoothing: float = 0.0,
+        **kwargs: Any,
+    ):
+        self.contract = check_observation_space(observation_space)
+        self.encoder_arguments: dict[str, Any] = dict(
+            encoder=encoder,
+            memory=memory,
+            encoder_kwargs=encoder_kwargs,
+            encoder_learning_rate=encoder_learning_rate,
+            encoder_weight_decay=encoder_weight_decay,
+            smoothing=smoothing,
+        )
+        self.feature_arguments: dict[str, Any] = dict(
+            uncertainty_input=uncertainty_input, mean_input=mean_input, privileged_gain=privileged_gain
+        )
+        for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
+            if kwargs.pop(name, None) not in (None, PolicyFeatures, {}, False):
+                raise ValueError(f"USPLPolicy builds its own features; '{name}' cannot be set.")
+        super().__init__(
+            policy_observation_space(self.contract),
+            action_space,
+            lr_schedule,
+            net_arch=[128, 128] if net_arch is None else net_arch,
+            activation_fn=activation_fn,
+            features_extractor_class=PolicyFeatures,
+            features_extractor_kwargs=None,
+            share_features_extractor=False,
+            **kwargs,
+        )
+        # Built after super().__init__, whose optimizer must not hold the encoder.
+        self.smoothing = smoothing
+        n_action = get_flattened_obs_dim(action_space)
+        self.encoder = ObservationEncoder(self.contract, n_action, encoder, memory, encoder_kwargs)
+        self.encoder_optimizer = th.optim.AdamW(
+            self.encoder.parameters(), lr=encoder_learning_rate, weight_decay=encoder_weight_decay
+        )
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """ActorCriticPolicy asks for the actor's features first, then for the critic's."""
+        key = TRUTH if hasattr(self, "pi_features_extractor") else PRIVILEGED
+        return PolicyFeatures(self.observation_space, key, **self.feature_arguments)  # type: ignore[arg-type]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.pop("features_extractor_class")
+        data.pop("features_extractor_kwargs")
+        return {**data, "observation_space": self.contract, **self.encoder_arguments, **self.feature_arguments}
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        return super().forward(self._only_policy_keys(obs), deterministic)  # type: ignore[arg-type]
+
+    def predict_values(self, obs: PyTorchObs) -> th.Tensor:
+        return super().predict_values(self._only_policy_keys(obs))
+
+    @staticmethod
+    def _only_policy_keys(obs: PyTorchObs) -> PyTorchObs:
+        assert isinstance(obs, dict)
+        return {key: obs[key] for key in POLICY_KEYS}
+
+    def set_action_std(self, std: float) -> None:
+        """
+        Fix the standard deviation of continuous actions (App. C.3.1 anneals it instead of learning it).
+
+        :param std: standard deviation of the sampled actions
+        """
+        self.log_std.requires_grad_(False)
+        self.log_std.data.fill_(math.log(std))
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, DeploymentState]:
+        """
+        Action of the deployment policy. A ``privileged`` key in the observation is ignored.
+
+        :param observation: ``common`` (and ``target``), of one environment or stacked
+        :param state: what the last call returned; None at the start
+        :param episode_start: which environments have just been reset, ``(n_envs,)``
+        :param deterministic: the actor's mode instead of a sample
+        :return: action(s) and the next state
+        :raises ValueError: for a missing key, a value that is not finite or a state of another number of environments
+        """
+        return self.act(observation, state, episode_start, deterministic)
+
+    def act(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        *,
+        privileged: np.ndarray | None = None,
+        uncertainty: np.ndarray | float | None = None,
+    ) -> tuple[np.ndarray, DeploymentState]:
+        """
+        :meth:`predict`, with a chosen privileged observation or uncertainty put in the place of the encoder's.
+
+        With the true privileged observation this is the privileged policy; a chosen uncertainty gives the paper's Fig. 7.
+
+        :param observation: see :meth:`predict`
+        :param state: see :meth:`predict`
+        :param episode_start: see :meth:`predict`
+        :param deterministic: see :meth:`predict`
+        :param privileged: shown to the actor instead of the encoder's mean, ``(n_envs, n_privileged)``
+        :param uncertainty: shown to the actor instead of the encoder's, broadcast to ``(n_envs, n_privileged)``
+        :return: action(s) and the next state
+        """
+        self.set_training_mode(False)
+        tokens, vectorized = self._as_tokens(observation)
+        n_envs = len(tokens[COMMON])
+        mean, std, previous_action, memory = self._unpack_state(state, n_envs)
+        if episode_start is not None:
+            rows = np.asarray(episode_start, dtype=bool).reshape(n_envs)
+            std[rows], previous_action[rows] = INITIAL_STD, 0.0
+            reset_rows(memory, th.as_tensor(rows, device=self.device))
+        tokens[PREVIOUS_ACTION] = th.as_tensor(previous_action, device=self.device)
+        with th.no_grad():
+            belief, memory = self.encoder.step(tokens, memory)
+            mean = belief.mean.cpu().numpy()
+            std = smooth(std, belief.std.cpu().numpy(), self.smoothing)
+            shown = mean if privileged is None else np.asarray(privileged, dtype=np.float32).reshape(mean.shape)
+            felt = std if uncertainty is None else np.broadcast_to(np.asarray(uncertainty, dtype=np.float32), std.shape)
+            obs = {PRIVILEGED: shown, TRUTH: shown, UNCERTAINTY: felt, BELIEF: mean}
+            tensors = {key: th.as_tensor(value.copy(), device=self.device) for key, value in obs.items()}
+            distribution = self.get_distribution({COMMON: tokens[COMMON], **tensors})
+            actions = distribution.get_actions(deterministic=deterministic).cpu().numpy()
+        actions = actions.reshape((n_envs, *self.action_space.shape))  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        encoded = preprocess_obs(th.as_tensor(actions), self.action_space, normalize_images=False)
+        assert isinstance(encoded, th.Tensor)
+        next_state = DeploymentState(
+            mean, std, encoded.reshape(n_envs, -1).numpy().copy(), tuple(part.cpu().numpy() for part in memory)
+        )
+        return (actions if vectorized else actions[0]), next_state
+
+    def _as_tokens(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[dict[str, th.Tensor], bool]:
+        if not isinstance(observation, dict):
+            raise ValueError(
+                f"The observation is a {type(observation).__name__}; expected a dict with the keys "
+                f"{[key for key in self.contract.spaces if key != PRIVILEGED]}. `env.reset()` of a Gymnasium env returns "
+                "(obs, info): pass only obs."
+            )
+        keys = [key for key in (COMMON, TARGET) if key in self.contract.spaces]
+        missing = [key for key in keys if key not in observation]
+        if missing:
+            raise ValueError(f"The observation has the keys {sorted(observation)}; the deployment policy also needs {missing}.")
+        arrays = {key: np.asarray(observation[key]) for key in keys}
+        check_finite(arrays)
+        vectorized = is_vectorized_observation(arrays[COMMON], self.contract[COMMON])
+        if not vectorized:
+            arrays = {key: array[None] for key, array in arrays.items()}
+        return {key: th.as_tensor(array, device=self.device) for key, array in arrays.items()}, vectorized
+
+    def _unpack_state(
+        self, state: tuple[np.ndarray, ...] | None, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, MemoryState]:
+        """Copies, because the memory is updated in place while the caller may keep the state."""
+        n_privileged = self.contract[PRIVILEGED].shape[0]  # type: ignore[index]
+        if state is None:
+            mean = np.zeros((n_envs, n_privileged), dtype=np.float32)
+            previous_action = np.zeros((n_envs, get_flattened_obs_dim(self.action_space)), dtype=np.float32)
+            return mean, np.full_like(mean, INITIAL_STD), previous_action, self.encoder.memory.initial_state(n_envs)
+        mean, std, previous_action, memory = state  # type: ignore[misc]
+        if len(std) != n_envs:
+            raise ValueError(
+                f"The state holds {len(std)} environments but {n_envs} observations were given: pass the state that predict "
+                "returned for the same environments, or None to start anew."
+            )
+        return mean, std.copy(), previous_action.copy(), tuple(th.as_tensor(part.copy(), device=self.device) for part in memory)
+
+
+class USPLCnnPolicy(USPLPolicy):
+    """
+    :class:`USPLPolicy` for image targets; the same network, with a clear error if there is no image.
+
+    :raises ValueError: if the observation space has no image under ``target``
+    """
+
+    def __init__(self, observation_space: spaces.Space, *args: Any, **kwargs: Any):
+        space = check_observation_space(observation_space)
+        if TARGET not in space.spaces or not is_image_space(space[TARGET]):
+            raise ValueError(
+                f"CnnPolicy needs a uint8 image (channels, height, width) under 'target', but the space is {space}. "
+                "Use MlpPolicy or MultiInputPolicy."
+            )
+        super().__init__(observation_space, *args, **kwargs)
+
+
+MlpPolicy = USPLPolicy
+CnnPolicy = USPLCnnPolicy
+MultiInputPolicy = USPLPolicy

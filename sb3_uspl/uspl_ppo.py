@@ -1,0 +1,460 @@
+"""USPL on top of Stable-Baselines3's PPO (Alg. 1)."""
+
+import warnings
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
+from sb3_uspl.encoder import gaussian_nll
+from sb3_uspl.observations import PRIVILEGED, check_observation_space
+from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
+from sb3_uspl.schedules import CosineSchedule, cosine_progress
+from sb3_uspl.uncertainty import C_MAX, C_MIN, DELTA, smoothing_factor
+from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
+
+SelfUSPLPPO = TypeVar("SelfUSPLPPO", bound="USPLPPO")
+
+PAPER_DECISION_PERIOD = 0.02
+"""s; assumed for an environment that does not say how long a decision lasts."""
+
+
+class USPLPPO(PPO):
+    """
+    Uncertainty-Sensitive Privileged Learning (Luo, Yuan, Yu; NeurIPS 2025) with PPO.
+
+    PPO trains a policy that sees the privileged observation, blurred by the uncertainty of an observation encoder that has to
+    predict it from the history of what the robot sees, on rewards scaled by that uncertainty. ``predict`` is the deployment
+    policy: encoder and policy together, without the privileged observation.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``USPLPolicy``
+    :param env: environment under the observation contract (see ``sb3_uspl.observations``)
+    :param learning_rate: of actor and critic. A number falls along a cosine to ``learning_rate_floor`` of itself by the end of
+        training (App. C.3.1); a schedule is used as it is. Paper: 1e-4 (actor), 5e-4 (critic) with Adam; SB3 has one optimizer.
+    :param n_steps: decisions per environment and rollout
+    :param batch_size: minibatch of PPO
+    :param n_epochs: passes of PPO over a rollout
+    :param gamma: discount factor per decision (paper: 0.998 per 20 ms, 0.995 for quadrotor and arm)
+    :param gae_lambda: of generalised advantage estimation (release: 0.97)
+    :param clip_range: of PPO
+    :param clip_range_vf: of PPO
+    :param normalize_advantage: of PPO
+    :param ent_coef: of PPO (the release's has no effect)
+    :param vf_coef: of PPO
+    :param max_grad_norm: of PPO, for actor and critic
+    :param use_sde: must be False
+    :param sde_sample_freq: unused
+    :param rollout_buffer_class: a subclass of ``USPLRolloutBuffer``
+    :param rollout_buffer_kwargs: its further arguments
+    :param target_kl: of PPO
+    :param learning_rate_floor: share of the learning rate left at the end of training (release: 1/20)
+    :param action_std: initial standard deviation of continuous actions, annealed by a cosine, not learned (Table 4: 0.35;
+        Table 5: 0.65). None learns it, as stock PPO does.
+    :param action_std_floor: share of ``action_std`` left at the end of training (release: 1/5)
+    :param warmup_timesteps: decisions before blurring and reward transformation set in (l = 0; C.3.1: 100 epochs). None: 20 %
+        of the first ``learn``.
+    :param ramp_timesteps: decisions over which the progress coefficient l rises to 1 (C.3.1: 300 epochs). None: 50 % of the
+        first ``learn``.
+    :param blur: privileged blurring, Eq. 3 and 4
+    :param reward_scaling: reward transformation, Eq. 2
+    :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)
+    :param mean_input: whether they also see the encoder's mean, as in the authors' release; needs ``uncertainty_input``
+    :param c_min: C_min of Eq. 2
+    :param c_max: C_max of Eq. 2
+    :param delta: delta of Eq. 2 (Tables 4 and 5)
+    :param blur_gain: K of Eq. 3 (Table 11)
+    :param blur_noise: distribution of epsilon_c in Eq. 3, "uniform" (bounded dimensions, clipped) or "gaussian"
+    :param blur_hold_time: s for which the blur noise is held (release: 10 decisions of 20 ms)
+    :param discrete_privileged: discrete dimensions and their values, blurred by Eq. 4, e.g. ``{0: [0.0, 0.25, 0.5]}``
+    :param smoothing_time: time constant of the uncertainty smoothing in s (release: 0.95 per 20 ms)
+    :param decision_period: s per decision. None asks the environment's ``decision_period``, else assumes the paper's 20 ms.
+    :param mismatch_fraction: share of environments that act on each other's privileged observation (release: 0.25). None: a
+        quarter, or none (with a warning) if that is fewer than two environments.
+    :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
+    :param replay_bytes: memory budget of the episode replay
+    :param encoder_learning_rate: of the encoder; constant, as in the release, unless a schedule is given (Tables 4 and 5: 5e-5
+        and 2e-5 for the large encoder)
+    :param encoder_weight_decay: of the encoder (Tables 4 and 5)
+    :param encoder_batch_size: decisions per encoder update, in whole episodes (Tables 4 and 5: 8000, 16000)
+    :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170)
+    :param encoder_max_grad_norm: gradient clipping of the encoder
+    :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
+    :param context_length: longest episode, in decisions
+    :param stats_window_size: as in SB3
+    :param tensorboard_log: as in SB3
+    :param policy_kwargs: for ``USPLPolicy``, e.g. ``dict(memory="transformer", encoder="paper")``
+    :param verbose: as in SB3
+    :param seed: as in SB3
+    :param device: as in SB3
+    :param _init_setup_model: as in SB3
+    :raises ValueError: for a space outside the contract or an argument outside its range, naming what to do
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: USPLPolicy
+    rollout_buffer: USPLRolloutBuffer
+
+    def __init__(
+        self,
+        policy: str | type[USPLPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int = 256,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = USPLRolloutBuffer,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        target_kl: float | None = None,
+        learning_rate_floor: float = 0.05,
+        action_std: float | None = 0.35,
+        action_std_floor: float = 0.2,
+        warmup_timesteps: int | None = None,
+        ramp_timesteps: int | None = None,
+        blur: bool = True,
+        reward_scaling: bool = True,
+        uncertainty_input: bool = True,
+        mean_input: bool = True,
+        c_min: float = C_MIN,
+        c_max: float = C_MAX,
+        delta: float = DELTA,
+        blur_gain: float = 10.0,
+        blur_noise: str = "uniform",
+        blur_hold_time: float = 0.2,
+        discrete_privileged: dict[int, list[float]] | None = None,
+        smoothing_time: float = 0.39,
+        decision_period: float | None = None,
+        mismatch_fraction: float | None = None,
+        replay: str = "mismatched",
+        replay_bytes: int = 256_000_000,
+        encoder_learning_rate: float | Schedule = 1e-3,
+        encoder_weight_decay: float = 0.0,
+        encoder_batch_size: int = 4096,
+        encoder_updates: int = 16,
+        encoder_max_grad_norm: float = 1.0,
+        encoder_warmup: bool = True,
+        context_length: int = 1024,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if use_sde:
+            raise ValueError("USPLPPO anneals the action noise itself (action_std); use_sde=True is not supported.")
+        if isinstance(learning_rate, int | float):
+            learning_rate = CosineSchedule(float(learning_rate), learning_rate_floor)
+        super().__init__(
+            # SB3 refuses "MlpPolicy" on a Dict space by its name, so the name is resolved first.
+            self.policy_aliases.get(policy, policy) if isinstance(policy, str) else policy,  # type: ignore[arg-type]
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            batch_size=batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            rollout_buffer_class=rollout_buffer_class or USPLRolloutBuffer,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            target_kl=target_kl,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.learning_rate_floor = learning_rate_floor
+        self.action_std, self.action_std_floor = action_std, action_std_floor
+        self.warmup_timesteps, self.ramp_timesteps = warmup_timesteps, ramp_timesteps
+        self.blur, self.reward_scaling = blur, reward_scaling
+        self.uncertainty_input, self.mean_input = uncertainty_input, mean_input and uncertainty_input
+        self.c_min, self.c_max, self.delta = c_min, c_max, delta
+        self.blur_gain, self.blur_noise, self.blur_hold_time = blur_gain, blur_noise, blur_hold_time
+        self.discrete_privileged = {int(dim): list(values) for dim, values in (discrete_privileged or {}).items()}
+        self.smoothing_time, self.decision_period = smoothing_time, decision_period
+        self.mismatch_fraction = mismatch_fraction
+        self.replay, self.replay_bytes = replay, replay_bytes
+        self.encoder_learning_rate = encoder_learning_rate
+        self.encoder_weight_decay = encoder_weight_decay
+        self.encoder_batch_size, self.encoder_updates = encoder_batch_size, encoder_updates
+        self.encoder_max_grad_norm, self.encoder_warmup = encoder_max_grad_norm, encoder_warmup
+        self.context_length = context_length
+        self._rollout_env: UncertaintyVecWrapper | None = None
+        self._progress_period: tuple[int, int] | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    # -- set-up ------------------------------------------------------------------------------------------------------------
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        self.n_mismatched = self._count_mismatched()
+        self.decision_period = self._ask_decision_period()
+        self.encoder_lr_schedule = FloatSchedule(self.encoder_learning_rate)
+        smoothing = smoothing_factor(self.smoothing_time, self.decision_period)
+        given = self.policy_kwargs, self.rollout_buffer_kwargs
+        self.policy_kwargs = {
+            **self.policy_kwargs,
+            "uncertainty_input": self.uncertainty_input,
+            "mean_input": self.mean_input,
+            "smoothing": smoothing,
+            "encoder_learning_rate": self.encoder_lr_schedule(1.0),
+            "encoder_weight_decay": self.encoder_weight_decay,
+        }
+        self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, "n_mismatched": self.n_mismatched}
+        super()._setup_model()
+        # What was derived stays out of the arguments that save() stores and load() compares.
+        self.policy_kwargs, self.rollout_buffer_kwargs = given
+        assert isinstance(self.observation_space, spaces.Dict)
+        self.rollout_buffer.episodes = EpisodeReplayBuffer(
+            self.observation_space,
+            get_flattened_obs_dim(self.action_space),
+            self.n_envs,
+            self.n_mismatched,
+            self.context_length,
+            self.replay_bytes,
+            self.replay,
+            self.seed,
+        )
+        if self.action_std is not None and isinstance(self.action_space, spaces.Box):
+            self._action_std_schedule: CosineSchedule | None = CosineSchedule(self.action_std, self.action_std_floor)
+            self.policy.set_action_std(self.action_std)
+        else:
+            self._action_std_schedule = None
+        self._uncertainty_config = UncertaintyConfig(
+            blur=self.blur,
+            reward_scaling=self.reward_scaling,
+            blur_gain=self.blur_gain,
+            noise=self.blur_noise,
+            noise_hold=max(1, round(self.blur_hold_time / self.decision_period)),
+            smoothing=smoothing,
+            c_min=self.c_min,
+            c_max=self.c_max,
+            delta=self.delta,
+            discrete_privileged=self.discrete_privileged,
+            n_mismatched=self.n_mismatched,
+        )
+        self._rollout_env = None
+
+    def _check_arguments(self) -> None:
+        space = check_observation_space(self.observation_space)[PRIVILEGED]
+        assert isinstance(space, spaces.Box)
+        if not issubclass(self.policy_class, USPLPolicy):
+            raise ValueError(f"USPLPPO needs a subclass of sb3_uspl.USPLPolicy as policy; {self.policy_class} was given.")
+        if not issubclass(self.rollout_buffer_class or USPLRolloutBuffer, USPLRolloutBuffer):
+            raise ValueError(f"USPLPPO needs a subclass of USPLRolloutBuffer; {self.rollout_buffer_class} was given.")
+        if self.blur_noise not in ("uniform", "gaussian"):
+            raise ValueError(f"blur_noise='{self.blur_noise}': choose 'uniform' or 'gaussian'.")
+        for dim, values in self.discrete_privileged.items():
+            if not 0 <= dim < space.shape[0]:
+                raise ValueError(f"discrete_privileged names dimension {dim}, but the privileged observation has {space.shape[0]}.")
+            if len(set(values)) < 2 or min(values) < space.low[dim] - 1e-6 or max(values) > space.high[dim] + 1e-6:
+                raise ValueError(
+                    f"discrete_privileged={{{dim}: {values}}}: give at least two different values within the bounds "
+                    f"[{space.low[dim]}, {space.high[dim]}] of that dimension."
+                )
+        continuous = [dim for dim in range(space.shape[0]) if dim not in self.discrete_privileged]
+        bounded = np.isfinite(space.low[continuous]) & np.isfinite(space.high[continuous])
+        if self.blur and self.blur_noise == "uniform" and not bounded.all():
+            raise ValueError(
+                f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give them "
+                "finite bounds, or use blur_noise='gaussian'."
+            )
+        ranges = {
+            "warmup_timesteps": (self.warmup_timesteps or 0, 0, np.inf),
+            "ramp_timesteps": (self.ramp_timesteps or 0, 0, np.inf),
+            "blur_gain": (self.blur_gain, 0, np.inf),
+            "blur_hold_time": (self.blur_hold_time, 0, np.inf),
+            "smoothing_time": (self.smoothing_time, 0, np.inf),
+            "c_max": (self.c_max, 0, np.inf),
+            "delta": (self.delta, 0, np.inf),
+            "encoder_updates": (self.encoder_updates, 0, np.inf),
+            "encoder_batch_size": (self.encoder_batch_size, 1, np.inf),
+            "context_length": (self.context_length, 1, np.inf),
+            "action_std": (1.0 if self.action_std is None else self.action_std, 1e-6, np.inf),
+            "mismatch_fraction": (self.mismatch_fraction or 0.0, 0, 0.9),
+            "decision_period": (1.0 if self.decision_period is None else self.decision_period, 1e-6, np.inf),
+        }
+        for name, (value, low, high) in ranges.items():
+            if not low <= value <= high:
+                raise ValueError(f"{name}={value} is outside of its range [{low}, {high}].")
+
+    def _count_mismatched(self) -> int:
+        automatic = self.mismatch_fraction is None
+        fraction = 0.25 if self.mismatch_fraction is None else self.mismatch_fraction
+        count = round(fraction * self.n_envs)
+        if fraction == 0.0 or count >= 2:
+            return count
+        needed = int(np.ceil(1.5 / fraction))
+        if automatic:
+            warnings.warn(
+                f"{self.n_envs} environment(s) are too few to set some apart with mismatched privileged observations, without "
+                f"which the encoder may learn to read the goal off the policy's behaviour (App. C.3.1). Use at least {needed}, "
+                "or silence this with mismatch_fraction=0."
+            )
+            return 0
+        raise ValueError(
+            f"mismatch_fraction={fraction} of {self.n_envs} environment(s) is no pair to swap privileged observations: "
+            f"use n_envs >= {needed}, a larger fraction, or mismatch_fraction=0."
+        )
+
+    def _ask_decision_period(self) -> float:
+        if self.decision_period is not None:
+            return self.decision_period
+        if self.env is not None:
+            try:
+                return float(self.env.get_attr("decision_period", indices=[0])[0])
+            except AttributeError:
+                pass
+        return PAPER_DECISION_PERIOD
+
+    # -- training ----------------------------------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfUSPLPPO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "USPLPPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfUSPLPPO:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        fresh = reset_num_timesteps or self._last_obs is None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self._progress_period is None or reset_num_timesteps:
+            warmup = int(0.2 * total_timesteps) if self.warmup_timesteps is None else self.warmup_timesteps
+            ramp = int(0.5 * total_timesteps) if self.ramp_timesteps is None else self.ramp_timesteps
+            self._progress_period = (warmup, ramp)
+        assert self.env is not None and isinstance(self._last_obs, dict)
+        wrapper = self._rollout_env
+        if wrapper is None or wrapper.venv is not self.env or wrapper.encoder is not self.policy.encoder:
+            wrapper = UncertaintyVecWrapper(self.env, self.policy.encoder, self._uncertainty_config, self.seed)
+            self._rollout_env, fresh = wrapper, True
+        if fresh:
+            assert self.rollout_buffer.episodes is not None
+            self.rollout_buffer.episodes.forget_running()
+            self._last_obs = wrapper.begin(self._last_obs)
+        return result
+
+    @property
+    def progress(self) -> float:
+        """Progress coefficient l of App. C.3.1, in [0, 1]."""
+        if self._progress_period is None:
+            return 0.0
+        return cosine_progress(self.num_timesteps, *self._progress_period)
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        # `model.env` stays what the user gave (callbacks, VecNormalize and set_env rely on it); only experience is transformed.
+        wrapper = self._rollout_env
+        assert wrapper is not None and env is self.env
+        wrapper.progress = self.progress
+        wrapper.redraw_mismatch()
+        if self._action_std_schedule is not None:
+            self.policy.set_action_std(self._action_std_schedule(self._current_progress_remaining))
+        return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        """Episode statistics of the privileged policy, without the mismatched environments."""
+        n_matched = len(infos) - self.n_mismatched
+        super()._update_info_buffer(infos[:n_matched], None if dones is None else dones[:n_matched])
+
+    def train(self) -> None:
+        """PPO's update, then the encoder's (Alg. 1, lines 12 and 13)."""
+        super().train()
+        wrapper, episodes = self._rollout_env, self.rollout_buffer.episodes
+        assert wrapper is not None and episodes is not None
+        for name, values in wrapper.metrics.items():
+            self.logger.record(f"uspl/{name}", float(np.mean(values)))
+        wrapper.metrics.clear()
+        self.logger.record("uspl/progress", wrapper.progress)
+        if self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0):
+            self._train_encoder(episodes)
+            tokens, lengths = episodes.running_tokens(self.device)
+            wrapper.rebuild_memory(tokens, lengths)
+        episodes.end_iteration()
+        self.logger.record("encoder/replay_episodes", len(episodes.replay))
+        self.logger.record("encoder/replay_fill", episodes.nbytes / episodes.max_bytes)
+
+    def _train_encoder(self, episodes: EpisodeReplayBuffer) -> None:
+        """Maximum likelihood on whole episodes, Eq. 1."""
+        encoder, optimizer = self.policy.encoder, self.policy.encoder_optimizer
+        learning_rate = self.encoder_lr_schedule(self._current_progress_remaining)
+        update_learning_rate(optimizer, learning_rate)
+        self.logger.record("encoder/learning_rate", learning_rate)
+        encoder.train()
+        losses, errors, stds = [], [], []
+        for update in range(self.encoder_updates):
+            batch = episodes.sample(self.encoder_batch_size, self.device)
+            if batch is None:
+                return
+            mask = batch.mask
+            if update == 0:
+                encoder.features.update_normalizers({key: value[mask] for key, value in batch.tokens.items()})
+            belief, _ = encoder(batch.tokens, batch.lengths)
+            loss = gaussian_nll(belief, batch.truth, mask)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            th.nn.utils.clip_grad_norm_(encoder.parameters(), self.encoder_max_grad_norm)
+            optimizer.step()
+            losses.append(loss.item())
+            errors.append((belief.mean - batch.truth)[mask].abs().mean().item())
+            stds.append(belief.std[mask].mean().item())
+        # PPO clips the gradients of the whole policy; the encoder's must not be among them.
+        optimizer.zero_grad(set_to_none=True)
+        encoder.eval()
+        self.logger.record("encoder/nll", float(np.mean(losses)))
+        self.logger.record("encoder/error", float(np.mean(errors)))
+        self.logger.record("encoder/std", float(np.mean(stds)))
+
+    # -- saving ------------------------------------------------------------------------------------------------------------
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_rollout_env"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer", "policy.encoder_optimizer"], []

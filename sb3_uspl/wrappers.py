@@ -1,0 +1,229 @@
+"""What turns an environment's experience into USPL's: encoder, blurring and reward transformation around any VecEnv."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_uspl.encoder import ObservationEncoder, reset_rows, take_rows
+from sb3_uspl.observations import (
+    BELIEF,
+    COMMON,
+    EPISODE_STEP,
+    POLICY_KEYS,
+    PREVIOUS_ACTION,
+    PRIVILEGED,
+    TARGET,
+    TRUTH,
+    UNCERTAINTY,
+    check_finite,
+)
+from sb3_uspl.uncertainty import (
+    C_MAX,
+    C_MIN,
+    DELTA,
+    INITIAL_STD,
+    blur_continuous,
+    blur_discrete,
+    reward_coefficient,
+    smooth,
+)
+
+
+@dataclass
+class UncertaintyConfig:
+    """How uncertainty shapes what PPO sees; times already in decisions. See ``USPLPPO`` for the meaning of each entry."""
+
+    blur: bool = True
+    reward_scaling: bool = True
+    blur_gain: float = 10.0
+    noise: str = "uniform"
+    noise_hold: int = 1
+    smoothing: float = 0.0
+    c_min: float = C_MIN
+    c_max: float = C_MAX
+    delta: float = DELTA
+    discrete_privileged: dict[int, list[float]] = field(default_factory=dict)
+    n_mismatched: int = 0
+
+
+class BlurNoise:
+    """
+    Noise of Eq. 3 and 4, held for a number of decisions so that it cannot be averaged away within a turn.
+
+    :param n_envs: number of environments
+    :param n_privileged: privileged dimensions
+    :param config: noise distribution, holding time, discrete values
+    :param rng: random generator
+    """
+
+    def __init__(self, n_envs: int, n_privileged: int, config: UncertaintyConfig, rng: np.random.Generator):
+        self.config, self.rng = config, rng
+        self.continuous = np.zeros((n_envs, n_privileged))
+        self.threshold = np.ones((n_envs, n_privileged))
+        self.replacement = np.zeros((n_envs, n_privileged))
+
+    def redraw(self, rows: np.ndarray) -> None:
+        """
+        :param rows: environments whose noise is due
+        """
+        shape = (len(rows), self.continuous.shape[1])
+        if len(rows) == 0:
+            return
+        draw = self.rng.uniform(-1.0, 1.0, shape) if self.config.noise == "uniform" else self.rng.standard_normal(shape)
+        self.continuous[rows] = draw
+        self.threshold[rows] = self.rng.uniform(size=shape)
+        for dim, values in self.config.discrete_privileged.items():
+            self.replacement[rows, dim] = self.rng.choice(np.asarray(values), size=len(rows))
+
+
+class UncertaintyVecWrapper(VecEnvWrapper):
+    """
+    Runs the encoder beside the environments (Alg. 1, lines 5-10).
+
+    Returned observations hold what the actor sees (``common``, blurred ``privileged``, ``uncertainty``, ``belief``), what only
+    the critic sees (``truth``) and what the encoder learns from (``target``, ``previous_action``, ``episode_step``).
+    ``terminal_observation`` is encoded with the memory from before the reset. Rewards are scaled with the uncertainty that the
+    action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations.
+
+    :param venv: environments under the observation contract
+    :param encoder: observation encoder
+    :param config: blurring, reward transformation, smoothing
+    :param seed: of the blur noise and the mismatching
+    """
+
+    def __init__(self, venv: VecEnv, encoder: ObservationEncoder, config: UncertaintyConfig, seed: int | None = None):
+        super().__init__(venv)
+        self.encoder, self.config = encoder, config
+        self.progress = 0.0
+        self.rng = np.random.default_rng(seed)
+        self.device = next(encoder.parameters()).device
+        space = venv.observation_space[PRIVILEGED]  # type: ignore[index]
+        self.low, self.high = space.low, space.high
+        self.noise = BlurNoise(self.num_envs, space.shape[0], config, self.rng)
+        self.metrics: dict[str, list[float]] = defaultdict(list)
+        self._shape = (self.num_envs, space.shape[0])
+        self._matched = np.arange(self.num_envs) < self.num_envs - config.n_mismatched
+
+    def reset(self) -> VecEnvObs:
+        return self.begin(self.venv.reset())  # type: ignore[arg-type]
+
+    def begin(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        Start with an empty history.
+
+        :param obs: current observation of the wrapped environments, or one returned by this wrapper
+        :return: observation for the policy
+        """
+        if TRUTH in obs:
+            obs = {PRIVILEGED: obs[TRUTH], **{key: obs[key] for key in (COMMON, TARGET) if key in obs}}
+        self.memory = self.encoder.memory.initial_state(self.num_envs)
+        self.std = np.full(self._shape, INITIAL_STD, dtype=np.float32)
+        self.previous_action = self._encode_action(np.zeros((self.num_envs, *self.action_space.shape)))  # type: ignore[misc]
+        self.previous_action[:] = 0.0
+        self.step_count = np.zeros(self.num_envs, dtype=np.int64)
+        self.redraw_mismatch()
+        return self._observe(obs)
+
+    def redraw_mismatch(self) -> None:
+        """Draw anew which mismatched environment sees whose privileged observation; never its own."""
+        order = self.rng.permutation(np.flatnonzero(~self._matched))
+        self._source = np.arange(self.num_envs)
+        self._source[order] = np.roll(order, 1)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.previous_action = self._encode_action(actions)
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(obs, dict)
+        if self.config.reward_scaling:
+            config = self.config
+            scale = reward_coefficient(self.std, self.progress, config.c_min, config.c_max, config.delta)
+            rewards = (rewards * scale).astype(np.float32)
+            self.metrics["reward_scale"].append(float(scale[self._matched].mean()))
+        self.step_count += 1
+        rows = np.flatnonzero(dones)
+        if len(rows):
+            self._rewrite_terminal(rows, infos)
+            reset_rows(self.memory, th.as_tensor(rows, device=self.device))
+            # A new array: the last observation, which PPO has yet to store, holds the old one.
+            self.std = np.where(dones[:, None], np.float32(INITIAL_STD), self.std)
+            self.previous_action[rows] = 0.0
+            self.step_count[rows] = 0
+        return self._observe(obs), rewards, dones, infos
+
+    @th.no_grad()
+    def rebuild_memory(self, tokens: dict[str, th.Tensor], lengths: th.Tensor) -> None:
+        """
+        Recompute every memory with the updated encoder in one pass, so that none mixes two encoders' states.
+
+        :param tokens: past of the running episodes without the current observation, ``(n_envs, longest, ...)``
+        :param lengths: number of past tokens, ``(n_envs,)``
+        """
+        _, self.memory = self.encoder(tokens, lengths)
+        _, self.memory = self.encoder.step(self._tokens, self.memory)
+
+    def _observe(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Encode the current observation of all environments and build what the policy sees."""
+        check_finite(obs)
+        self._tokens = self._as_tokens(obs, self.previous_action)
+        with th.no_grad():
+            belief, self.memory = self.encoder.step(self._tokens, self.memory)
+        mean = belief.mean.cpu().numpy()
+        self.std = smooth(self.std, belief.std.cpu().numpy(), self.config.smoothing)
+        self.noise.redraw(np.flatnonzero(self.step_count % self.config.noise_hold == 0))
+        shown = self._blur(obs[PRIVILEGED][self._source], self.std, np.arange(self.num_envs))
+        out = self._assemble(obs, shown, mean, self.std)
+        out |= {PREVIOUS_ACTION: self.previous_action, EPISODE_STEP: self.step_count.copy()}
+        if TARGET in obs:
+            out[TARGET] = obs[TARGET]
+        matched = self._matched
+        self.metrics["uncertainty"].append(float(self.std[matched].mean()))
+        self.metrics["prediction_error"].append(float(np.abs(mean - obs[PRIVILEGED])[matched].mean()))
+        self.metrics["blur"].append(float(np.abs(shown - obs[PRIVILEGED])[matched].mean()))
+        return out
+
+    def _rewrite_terminal(self, rows: np.ndarray, infos: list[dict]) -> None:
+        """Encode the last observations of ended episodes with the history that they belong to."""
+        last = {key: np.stack([infos[i]["terminal_observation"][key] for i in rows]) for key in self.observation_space.spaces}  # type: ignore[attr-defined]
+        check_finite(last)
+        with th.no_grad():
+            memory = take_rows(self.memory, th.as_tensor(rows, device=self.device))
+            belief, _ = self.encoder.step(self._as_tokens(last, self.previous_action[rows]), memory)
+        std = smooth(self.std[rows], belief.std.cpu().numpy(), self.config.smoothing)
+        shown = self._blur(last[PRIVILEGED], std, rows)
+        terminal = self._assemble(last, shown, belief.mean.cpu().numpy(), std)
+        for index, row in enumerate(rows):
+            infos[row]["terminal_observation"] = {key: terminal[key][index] for key in POLICY_KEYS}
+
+    def _blur(self, privileged: np.ndarray, std: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        if not self.config.blur:
+            return privileged
+        noise, config = self.noise, self.config
+        shown = blur_continuous(
+            privileged, std, noise.continuous[rows], config.blur_gain, self.progress, self.low, self.high
+        ).astype(np.float32)
+        if config.discrete_privileged:
+            dims = list(config.discrete_privileged)
+            replaced = blur_discrete(privileged, std, noise.threshold[rows], noise.replacement[rows], self.progress)
+            shown[:, dims] = replaced[:, dims]
+        return shown
+
+    @staticmethod
+    def _assemble(obs: dict[str, np.ndarray], shown: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, np.ndarray]:
+        return {COMMON: obs[COMMON], PRIVILEGED: shown, TRUTH: obs[PRIVILEGED], UNCERTAINTY: std, BELIEF: mean}
+
+    def _encode_action(self, actions: np.ndarray) -> np.ndarray:
+        encoded = preprocess_obs(th.as_tensor(actions), self.action_space, normalize_images=False)
+        assert isinstance(encoded, th.Tensor)
+        return encoded.reshape(self.num_envs, -1).numpy().copy()
+
+    def _as_tokens(self, obs: dict[str, np.ndarray], previous_action: np.ndarray) -> dict[str, th.Tensor]:
+        tokens = {key: th.as_tensor(obs[key], device=self.device) for key in (COMMON, TARGET) if key in obs}
+        return {**tokens, PREVIOUS_ACTION: th.as_tensor(previous_action, device=self.device)}
