@@ -60,10 +60,10 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.view = view
         self.decision_period = task.decision_period
         self.metadata = {**self.metadata, "render_fps": round(1.0 / task.decision_period)}
-        observations = {"common": task.common_space, "privileged": task.privileged_space}
+        observations: dict[str, spaces.Space[Any]] = {"common": task.common_space, "privileged": task.privileged_space}
         if self.sensors:
             observations["target"] = self.sensors[0].space
-        self.observation_space = spaces.Dict(observations)
+        self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
         self.action_space = task.action_space
         self._action_shape = task.action_space.shape
 
@@ -95,6 +95,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         :param options: none are known
         :raises ValueError: if there are options
         """
+        self._check_open()
         super().reset(seed=seed)
         if options:
             raise ValueError(f"Unknown reset options {sorted(options)}; this environment has none.")
@@ -117,6 +118,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         :param action: numbers in the action space; those beyond its bounds are clipped
         :raises ValueError: if the action has another shape or is not finite
         """
+        self._check_open()
         task, robot = self.task, self.robot
         robot.command(task.command(self._checked(action), robot.state))
         contacts = 0
@@ -138,6 +140,11 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         if self.render_mode == "human":
             time.sleep(self.decision_period)
         return self._observation(), sum(terms.values()), outcome is not Outcome.RUNNING, False, info
+
+    def _check_open(self) -> None:
+        # PyBullet gives the number of a closed client to the next one: a step now would move somebody else's robot.
+        if self.simulation.closed:
+            raise RuntimeError("This environment is closed; make a new one.")
 
     def _checked(self, action: np.ndarray) -> list[float]:
         """The action as floats within [-1, 1]."""
@@ -162,6 +169,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """
         if self.render_mode != "rgb_array":
             return None
+        self._check_open()
         if self.view == "top":
             return self.simulation.picture(self.task.camera, *self.task.picture_size)
         state = self.robot.state

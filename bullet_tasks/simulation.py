@@ -97,12 +97,11 @@ class Simulation:
     """
 
     def __init__(self, gui: bool = False) -> None:
-        self._closed = True
         # PyBullet ends the whole process when it cannot open its window, so the display is looked for first.
         if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             raise RuntimeError('render_mode="human" opens a window and needs a display; use render_mode="rgb_array" here.')
         self.client: Any = _Client(pybullet.GUI if gui else pybullet.DIRECT)
-        self._closed = False
+        self.closed = False
         self._ids: dict[str, int] = {}
         self._names: dict[int, str] = {}
         if gui:
@@ -272,11 +271,8 @@ class Simulation:
 
     def close(self) -> None:
         """Disconnect; a second call does nothing."""
-        if self._closed:
+        if self.closed:
             return
-        self._closed = True
+        self.closed = True
+        # A simulation that is dropped unclosed is disconnected by BulletClient, which knows whose process it is.
         self.client.disconnect()
-
-    def __del__(self) -> None:
-        # A forked child inherits this object but not the physics server behind it: BulletClient knows whose it is.
-        self._closed = True

@@ -120,7 +120,7 @@ class NavigationTask(Task):
         terms = {
             "goal_progress": reward.goal_progress * (self._distance - distance),
             "heading_progress": reward.heading_progress * (self._heading_error - heading_error),
-            "collision": reward.collision * contact_time,
+            "collision": reward.collision * contact_time if contact_time else 0.0,
             "goal_bonus": reward.goal_bonus + reward.time_bonus * time_left if outcome is Outcome.SUCCESS else 0.0,
         }
         self._distance, self._heading_error = distance, heading_error

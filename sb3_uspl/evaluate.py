@@ -1,0 +1,101 @@
+"""``python -m sb3_uspl.evaluate``: success of a trained agent over fresh episodes, all of them counted."""
+
+import argparse
+import json
+import os
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, BulletVecEnv, register, rl_zoo3
+from sb3_uspl.evaluation import EVALUATION_SEED, evaluate
+
+
+def load_agent(
+    algo: str, env_id: str, folder: str, exp_id: int = 0, best: bool = False, n_envs: int = 32, env_kwargs: dict[str, Any] | None = None
+) -> tuple[BaseAlgorithm, VecEnv]:
+    """
+    Load an agent and its environments from the zoo's layout ``<folder>/<algo>/<env>_<exp_id>/``.
+
+    :param algo: zoo name of the algorithm
+    :param env_id: environment
+    :param folder: log folder
+    :param exp_id: experiment number; 0 is the latest
+    :param best: the best model of the training's evaluations instead of the last one
+    :param n_envs: number of environments
+    :param env_kwargs: passed to the environment
+    :return: model and environments, normalised as in training
+    """
+    from rl_zoo3.utils import create_test_env, get_model_path, get_saved_hyperparams
+
+    name = rl_zoo3.utils.EnvironmentName(env_id)
+    _, model_path, log_path = get_model_path(exp_id, folder, algo, name, load_best=best)
+    hyperparams, stats_path = get_saved_hyperparams(os.path.join(log_path, env_id), test_mode=True)
+    venv = create_test_env(
+        env_id,
+        n_envs=n_envs,
+        stats_path=stats_path,
+        seed=EVALUATION_SEED,
+        should_render=False,
+        hyperparams=hyperparams,
+        env_kwargs=env_kwargs,
+        vec_env_cls=BulletVecEnv,
+    )
+    return rl_zoo3.ALGOS[algo].load(model_path, device="cpu"), venv
+
+
+def parse_arguments() -> argparse.Namespace:
+    """:return: command line"""
+    parser = argparse.ArgumentParser(prog="python -m sb3_uspl.evaluate", description=__doc__)
+    parser.add_argument("--algo", default="uspl_ppo", help=f"algorithm ({', '.join(ALGORITHMS)} or one of the zoo's)")
+    parser.add_argument("--env", required=True, help="environment, e.g. LateralChoice-v0")
+    parser.add_argument("--episodes", type=int, default=500, help="episodes of each policy")
+    parser.add_argument("-f", "--folder", default=str(TRAINED_AGENTS), help="log folder; default: the shipped agents")
+    parser.add_argument("--exp-id", type=int, default=0, help="experiment number; default: the latest")
+    parser.add_argument("--load-best", action="store_true", help="best model of the training's evaluations")
+    parser.add_argument("--policy", choices=("deployment", "privileged", "both"), default="both")
+    parser.add_argument("--physics", choices=("kinematic", "full"), help="fidelity of the robot; default: the environment's")
+    parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
+    parser.add_argument("--n-envs", type=int, default=32, help="environments that run at the same time")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Evaluate and print."""
+    arguments = parse_arguments()
+    if arguments.episodes < 1:
+        raise SystemExit(f"--episodes {arguments.episodes}: at least one episode is needed.")
+    register()
+    th.set_num_threads(1)
+    env_kwargs = {"physics": arguments.physics} if arguments.physics else None
+    try:
+        model, venv = load_agent(
+            arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, arguments.n_envs, env_kwargs
+        )
+    except (AssertionError, ValueError) as error:
+        raise SystemExit(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error
+    result = {"algo": arguments.algo, "env": arguments.env, "physics": arguments.physics}
+    result |= evaluate(model, venv, arguments.episodes, arguments.seed, arguments.policy)
+    venv.close()
+    if arguments.json:
+        print(json.dumps(result))
+        return
+    for name in ("deployment", "privileged"):
+        prefix = "" if name == "deployment" else "privileged_"
+        if result[f"{prefix}success_rate"] is not None:
+            low, high = result[f"{prefix}success_interval"]
+            print(
+                f"{name:>10} policy: success {result[f'{prefix}success_rate']:.1%} (95 % interval {low:.1%} - {high:.1%}), "
+                f"return {result[f'{prefix}mean_return']:.2f}, length {result[f'{prefix}mean_length']:.1f} decisions"
+            )
+    if result["prediction_error_final"] is not None:
+        print(f"prediction error at the end of an episode: {result['prediction_error_final']:.4f}")
+    if result["divergence_mean"] is not None:
+        print(f"distance between privileged and deployment policy, mean over time: {result['divergence_mean']:.3f}")
+
+
+if __name__ == "__main__":
+    main()

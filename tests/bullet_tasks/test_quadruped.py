@@ -1,0 +1,106 @@
+"""Laws of the kinematic quadruped: it follows its command exactly unless something is in its way."""
+
+import itertools
+import math
+
+import pytest
+
+from bullet_tasks.robots.quadruped import (
+    BODY_HEIGHT,
+    BODY_RADIUS,
+    MAX_YAW_RATE,
+    WALKING_SPEED,
+    QuadrupedCommand,
+    make_quadruped,
+)
+from bullet_tasks.shapes import Box
+from bullet_tasks.simulation import Simulation
+
+SUBSTEP = 1.0 / 20.0
+WALL = Box("wall", (0.0, 0.0, 0.0), (0.1, 3.0, 1.0))
+
+
+@pytest.fixture
+def simulation():
+    simulation = Simulation()
+    yield simulation
+    simulation.close()
+
+
+@pytest.fixture
+def robot(simulation):
+    return make_quadruped(simulation)
+
+
+def walk(robot, target_yaw, seconds):
+    robot.command(QuadrupedCommand(WALKING_SPEED, target_yaw))
+    return [robot.substep() for _ in range(round(seconds / SUBSTEP))]
+
+
+def test_a_straight_walk_is_exact(robot):
+    robot.reset(1.0, 2.0, 0.5, 0.3)
+    state = walk(robot, 0.3, 4.0)[-1]
+    assert state.x == pytest.approx(1.0 + 4.0 * WALKING_SPEED * math.cos(0.3), abs=1e-9)
+    assert state.y == pytest.approx(2.0 + 4.0 * WALKING_SPEED * math.sin(0.3), abs=1e-9)
+    assert state.z == 0.5 + BODY_HEIGHT
+    assert math.hypot(state.vx, state.vy) == pytest.approx(WALKING_SPEED)
+    assert not state.in_contact
+
+
+def test_a_turn_is_limited_and_settles(robot):
+    robot.reset(0.0, 0.0, 0.0, 0.0)
+    yaws = [0.0, *(state.yaw for state in walk(robot, 2.0, 3.0))]
+    rates = [(b - a) / SUBSTEP for a, b in itertools.pairwise(yaws)]
+    assert max(rates) == pytest.approx(MAX_YAW_RATE)
+    assert min(rates) >= -1e-9, "no overshoot"
+    assert yaws[-1] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_yaw_is_continuous_over_many_turns(robot):
+    robot.reset(0.0, 0.0, 0.0, 3.0)
+    for _ in range(8):
+        walk(robot, robot.state.yaw + 3.0, 2.0)
+    assert robot.state.yaw == pytest.approx(3.0 + 8 * 3.0, abs=0.05)
+
+
+def test_a_heading_beyond_half_a_turn_is_reached_the_shorter_way(robot):
+    robot.reset(0.0, 0.0, 0.0, 0.0)
+    assert walk(robot, 1.5 * math.pi, 3.0)[-1].yaw == pytest.approx(-0.5 * math.pi, abs=1e-3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.6, 1.2])
+def test_a_wall_stops_the_body_at_its_face_without_tilting_it(simulation, robot, angle):
+    simulation.add_body("wall", WALL, (WALL,), (2.0, 0.0, 0.5))
+    robot.reset(1.5, 0.0, 0.0, angle)
+    states = walk(robot, angle, 3.0)
+    assert states[-1].in_contact and not states[0].in_contact
+    assert states[-1].x == pytest.approx(1.9 - BODY_RADIUS, abs=0.005)
+    # Bullet sees a contact at most 2 cm ahead, so the impact may sink in by less than the length of one substep.
+    assert max(state.x for state in states) < 1.9 - BODY_RADIUS + WALKING_SPEED * SUBSTEP
+    assert states[-1].yaw == pytest.approx(angle, abs=1e-3), "it slides along and keeps its heading"
+    if angle:
+        assert states[-1].vy == pytest.approx(WALKING_SPEED * math.sin(angle), rel=0.02)
+    _, orientation = simulation.client.getBasePositionAndOrientation(simulation.body_id(robot.name))
+    assert abs(orientation[0]) < 1e-5 and abs(orientation[1]) < 1e-5
+    # Turned round, it walks off at once.
+    away = walk(robot, robot.state.yaw + math.pi, 4.0)
+    assert not away[-1].in_contact and away[-1].x < 1.0
+
+
+def test_a_narrow_dead_end_lets_the_body_out_again(simulation, robot):
+    for name, x, y, half in (
+        ("end", 1.0, 0.0, (0.1, 1.0, 0.5)),
+        ("left", 0.0, 0.35, (1.0, 0.1, 0.5)),
+        ("right", 0.0, -0.35, (1.0, 0.1, 0.5)),
+    ):
+        shape = Box(name, (0.0, 0.0, 0.0), half)
+        simulation.add_body(name, shape, (shape,), (x, y, 0.5))
+    robot.reset(-0.5, 0.0, 0.0, 0.0)
+    assert walk(robot, 0.0, 4.0)[-1].in_contact
+    assert walk(robot, math.pi, 4.0)[-1].x < 0.0
+
+
+@pytest.mark.parametrize("physics", ["full", "legs"])
+def test_physics_that_does_not_exist_is_refused(simulation, physics):
+    with pytest.raises(ValueError, match=f"{physics}.*available.*kinematic"):
+        make_quadruped(simulation, physics)

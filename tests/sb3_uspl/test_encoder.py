@@ -1,0 +1,165 @@
+"""The encoder: cached steps equal whole episodes, Eq. 1 by hand, sizes of the presets."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_uspl.encoder import (
+    MAX_STD,
+    MEMORIES,
+    MIN_STD,
+    Belief,
+    GRUMemory,
+    ObservationEncoder,
+    RunningNormalizer,
+    TransformerMemory,
+    gaussian_nll,
+    reset_rows,
+    soft_clamp,
+    take_rows,
+)
+from tests.sb3_uspl.toy import IMAGE, ToyEnv
+
+
+def make_memory(name):
+    th.manual_seed(0)
+    return GRUMemory(16) if name == "gru" else TransformerMemory(16, n_heads=2, head_width=8, n_layers=2)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_steps_equal_whole_episodes_across_resets_and_cache_growth(name):
+    memory, n_tokens = make_memory(name), TransformerMemory.CACHE_BLOCK + 20
+    features = th.randn(3, n_tokens, 16)
+    resets = {0: (), 1: (5,), 2: (40, n_tokens - 2)}
+    state, outputs = memory.initial_state(3), []
+    with th.no_grad():
+        for t in range(n_tokens):
+            rows = th.tensor([t in resets[env] for env in range(3)])
+            reset_rows(state, rows)
+            out, state = memory.step(features[:, t], state)
+            outputs.append(out)
+        outputs = th.stack(outputs, 1)
+        for env, times in resets.items():
+            edges = [0, *times, n_tokens]
+            for start, stop in zip(edges[:-1], edges[1:], strict=True):
+                whole, _ = memory(features[env : env + 1, start:stop], th.tensor([stop - start]))
+                th.testing.assert_close(outputs[env, start:stop], whole[0], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_state_after_a_padded_pass_continues_like_single_steps(name):
+    memory = make_memory(name)
+    features, lengths, token = th.randn(3, 10, 16), th.tensor([10, 4, 0]), th.randn(3, 16)
+    with th.no_grad():
+        _, state = memory(features, lengths)
+        after_pass, _ = memory.step(token, state)
+        for env, length in enumerate(lengths):
+            single = memory.initial_state(1)
+            for t in range(length):
+                _, single = memory.step(features[env : env + 1, t], single)
+            expected, _ = memory.step(token[env : env + 1], single)
+            th.testing.assert_close(after_pass[env], expected[0], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_taken_rows_are_independent(name):
+    memory = make_memory(name)
+    with th.no_grad():
+        _, state = memory(th.randn(2, 5, 16), th.tensor([5, 5]))
+        before = [part.clone() for part in state]
+        memory.step(th.randn(1, 16), take_rows(state, th.tensor([1])))
+    for part, old in zip(state, before, strict=True):
+        th.testing.assert_close(part, old)
+
+
+def test_the_future_does_not_reach_the_past():
+    memory = make_memory("transformer")
+    features = th.randn(1, 6, 16)
+    changed = features.clone()
+    changed[:, 4:] += 1.0
+    with th.no_grad():
+        a, b = memory(features, th.tensor([6]))[0], memory(changed, th.tensor([6]))[0]
+    th.testing.assert_close(a[:, :4], b[:, :4])
+    assert not th.allclose(a[:, 4:], b[:, 4:])
+
+
+def test_eq_1_hand_computed():
+    belief = Belief(th.tensor([[[0.0, 1.0], [5.0, 5.0]]]), th.log(th.tensor([[[0.5, 2.0], [1.0, 1.0]]])))
+    truth = th.tensor([[[0.5, 1.0], [0.0, 0.0]]])
+    # First token: z = 1 and 0; the second one is padding.
+    expected = 0.5 + math.log(0.5) + math.log(2.0) + math.log(2 * math.pi)
+    assert gaussian_nll(belief, truth, th.tensor([[True, False]])).item() == pytest.approx(expected)
+
+
+def test_soft_clamp_stays_inside_and_keeps_a_gradient():
+    x = th.linspace(-20, 20, 101, requires_grad=True)
+    y = soft_clamp(x, math.log(MIN_STD), math.log(MAX_STD))
+    assert (y.exp() >= MIN_STD - 1e-6).all() and (y.exp() <= MAX_STD + 0.01).all()
+    y.sum().backward()
+    assert (x.grad > 0).all()
+    assert soft_clamp(th.zeros(1), math.log(MIN_STD), 0.0).exp().item() == pytest.approx(0.505, abs=0.005)  # release
+
+
+def test_untrained_belief_is_wide_and_centred():
+    encoder = ObservationEncoder(ToyEnv().observation_space, 1)
+    belief, _ = encoder.step({"common": th.randn(4, 2), "previous_action": th.randn(4, 1)}, encoder.memory.initial_state(4))
+    assert belief.mean.abs().max() < 0.1 and (belief.std - 0.5).abs().max() < 0.05
+
+
+def test_normalizer_statistics_equal_those_of_all_data():
+    normalizer, rng = RunningNormalizer(3), np.random.default_rng(0)
+    batches = [th.as_tensor(rng.normal([1, -2, 0], [3, 0.5, 1], (n, 3)), dtype=th.float32) for n in (5, 50, 500)]
+    for batch in batches:
+        normalizer.update(batch)
+    everything = th.cat(batches)
+    th.testing.assert_close(normalizer.mean, everything.mean(0), atol=1e-4, rtol=1e-4)
+    th.testing.assert_close(normalizer.var, everything.var(0, correction=0), atol=1e-4, rtol=1e-4)
+    normalized = normalizer(everything)
+    assert normalized.mean(0).abs().max() < 1e-4 and (normalized.std(0) - 1).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("preset", ["small", "paper"])
+@pytest.mark.parametrize("memory", MEMORIES)
+@pytest.mark.parametrize("target", [None, spaces.Box(-1, 1, (7,), np.float32), IMAGE], ids=["blind", "vector", "image"])
+def test_every_preset_handles_every_input(preset, memory, target):
+    encoder = ObservationEncoder(ToyEnv(target=target, n_privileged=2).observation_space, 3, preset, memory)
+    tokens = {"common": th.randn(2, 4, 2), "previous_action": th.randn(2, 4, 3)}
+    if target is not None:
+        tokens["target"] = th.as_tensor(np.stack([np.stack([target.sample() for _ in range(4)]) for _ in range(2)]))
+    belief, _ = encoder(tokens, th.tensor([4, 3]))
+    assert belief.mean.shape == belief.std.shape == (2, 4, 2)
+
+
+def test_the_paper_preset_has_the_papers_transformer():
+    memory = ObservationEncoder(ToyEnv().observation_space, 1, "paper", "transformer").memory
+    assert (memory.n_heads, memory.head_width, memory.width) == (16, 64, 256)
+
+
+@pytest.mark.parametrize("kwargs", [{"preset": "huge"}, {"memory": "lstm"}, {"overrides": {"depth": 3}}])
+def test_unknown_architecture_is_refused(kwargs):
+    with pytest.raises(ValueError, match=r"presets are|unknown entries"):
+        ObservationEncoder(ToyEnv().observation_space, 1, **kwargs)
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_either_memory_learns_what_was_revealed_and_says_when(memory):
+    """A sign is shown at the third token only: before it the belief is the prior, after it (nearly) certain."""
+    th.manual_seed(0)
+    encoder = ObservationEncoder(ToyEnv().observation_space, 1, memory=memory)
+    optimizer = th.optim.Adam(encoder.parameters(), 2e-3)
+    sign = 2.0 * th.randint(0, 2, (256, 1)) - 1.0
+    common = th.zeros(256, 8, 2)
+    common[:, 2, 1] = sign[:, 0]
+    tokens = {"common": common, "previous_action": th.zeros(256, 8, 1)}
+    truth = (0.25 * sign)[:, None].expand(-1, 8, -1)
+    lengths, mask = th.full((256,), 8), th.ones(256, 8, dtype=th.bool)
+    for _ in range(150):
+        loss = gaussian_nll(encoder(tokens, lengths)[0], truth, mask)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    std = encoder(tokens, lengths)[0].std.mean(0)[:, 0]
+    assert (std[:2] > 0.2).all() and (std[3:] < 0.05).all()
