@@ -95,8 +95,8 @@ class LateralChoice(NavigationTask):
         There is no ``target``.
 
     Action
-        Box(1) in [-1, 1]: turn by action * pi rad from the present yaw, held for 0.25 s. The robot always walks at 0.7
-        m/s; it turns at up to 2 rad/s, so a half turn takes 0.7 m of the corridor's width.
+        Box(1) in [-1, 1]: turn by action * pi/4 from the present yaw, held for 0.25 s. The robot always walks at 0.7 m/s;
+        it turns at up to 2 rad/s, so a half turn takes 0.7 m of the corridor's width.
 
     Rewards
         ``goal_progress`` +4 per m nearer to the goal; ``heading_progress`` +2 per rad of heading error removed;
@@ -114,7 +114,8 @@ class LateralChoice(NavigationTask):
         to the other. Beginning with the end that the robot faces, that takes 11 s on average and up to 18 s of the 20 s.
 
     Differences from the paper and its release
-        Decisions every 0.25 s instead of 20 ms. No legs in ``physics="kinematic"``, hence none of the small locomotion
+        Decisions every 0.25 s instead of 20 ms, and turns of pi/4 instead of pi, which at 2 rad/s is all that a decision can
+        turn. No legs in ``physics="kinematic"``, hence none of the small locomotion
         rewards, no falls by tipping over, and a flat floor without the +-2 cm roughness. The goal counts at once, not
         after three control steps. The goal is one privileged number (x), as its y is always 0.
 

@@ -14,6 +14,9 @@ from bullet_tasks.tasks.base import Outcome, Task
 
 POSITION_SCALE = 8.0
 """Positions are observed in units of this length, m (the authors' release)."""
+MAX_TURN = math.pi / 4.0
+"""Heading change that the action 1 asks for, rad. The release asks for up to pi, anew every 20 ms; the robot turns at 2 rad/s,
+so no decision of 0.25 s can turn it further than this range allows, and a larger one would only make most actions the same."""
 FALL_HEIGHT = -0.25
 """A robot over ground lower than this has fallen, m (the authors' release)."""
 
@@ -85,12 +88,12 @@ class NavigationTask(Task):
 
     def command(self, action: Sequence[float], state: RobotState) -> QuadrupedCommand:
         """
-        Turn by up to half a turn either way, always walking (see base class).
+        Turn by up to ``MAX_TURN`` either way, always walking (see base class).
 
-        :param action: turn in units of pi rad, ``(1,)``
+        :param action: turn in units of ``MAX_TURN``, ``(1,)``
         :param state: of the robot, now
         """
-        return QuadrupedCommand(WALKING_SPEED, state.yaw + math.pi * action[0])
+        return QuadrupedCommand(WALKING_SPEED, state.yaw + MAX_TURN * action[0])
 
     def outcome(self, state: RobotState) -> Outcome:
         """

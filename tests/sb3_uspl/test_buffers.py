@@ -1,0 +1,135 @@
+"""What goes into the buffers comes out of them, and nothing else."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
+from tests.sb3_uspl.toy import IMAGE, ToyEnv
+
+N_ENVS = 4
+
+
+def make_episodes(**kwargs):
+    target = kwargs.pop("target", None)
+    kwargs = {"n_mismatched": 2, "context_length": 100, "max_bytes": 10**6, "seed": 0, **kwargs}
+    return EpisodeReplayBuffer(ToyEnv(target=target).observation_space, 1, N_ENVS, **kwargs)
+
+
+def observation(steps, value, target=None):
+    obs = {
+        "common": np.full((N_ENVS, 2), value, np.float32),
+        "privileged": np.full((N_ENVS, 1), -1.0, np.float32),
+        "truth": np.arange(N_ENVS, dtype=np.float32)[:, None],
+        "uncertainty": np.full((N_ENVS, 1), 0.5, np.float32),
+        "belief": np.zeros((N_ENVS, 1), np.float32),
+        "previous_action": np.full((N_ENVS, 1), value - 1, np.float32),
+        "episode_step": np.array(steps),
+    }
+    return obs | ({"target": np.full((N_ENVS, *target.shape), value, target.dtype)} if target else {})
+
+
+def fill(episodes, lengths, n_steps, target=None):
+    for t in range(n_steps):
+        episodes.add(observation([t % length for length in lengths], t, target))
+
+
+def test_episodes_come_out_as_they_went_in():
+    episodes = make_episodes(target=IMAGE)
+    fill(episodes, [3, 5, 80, 7], 81, IMAGE)  # 80: the running arrays have to grow
+    by_env = {env: [e for e in episodes.fresh if e.arrays["truth"][0, 0] == env] for env in range(N_ENVS)}
+    assert [len(by_env[env]) for env in range(N_ENVS)] == [26, 16, 1, 11]
+    for env, length in enumerate([3, 5, 80, 7]):
+        for number, episode in enumerate(by_env[env]):
+            assert len(episode) == length
+            assert episode.mismatched == (env >= 2)
+            np.testing.assert_array_equal(episode.arrays["common"][:, 0], number * length + np.arange(length))
+            np.testing.assert_array_equal(episode.arrays["previous_action"][:, 0], number * length + np.arange(length) - 1)
+            assert episode.arrays["target"].dtype == np.uint8
+            np.testing.assert_array_equal(episode.arrays["target"][:, 0, 0, 0], number * length + np.arange(length))
+
+
+def test_batches_are_padded_and_masked():
+    episodes = make_episodes()
+    fill(episodes, [3, 5, 9, 7], 20)
+    batch = episodes.sample(200)
+    assert batch.mask.sum() == batch.lengths.sum() >= 200
+    assert batch.truth.shape[:2] == batch.mask.shape == batch.tokens["common"].shape[:2]
+    assert (batch.tokens["common"][~batch.mask] == 0).all()
+
+
+def test_half_of_a_batch_is_fresh_and_half_replayed():
+    episodes = make_episodes(keep="all")
+    fill(episodes, [5] * 4, 21)
+    episodes.end_iteration()
+    for t in range(21, 42):
+        episodes.add(observation([(t - 21) % 5] * 4, t))
+    first_value = episodes.sample(10_000).tokens["common"][:, 0, 0]
+    assert ((first_value >= 21).float().mean() - 0.5).abs() < 0.05
+
+
+@pytest.mark.parametrize(("keep", "expected"), [("mismatched", {True}), ("all", {True, False})])
+def test_what_is_replayed(keep, expected):
+    episodes = make_episodes(keep=keep)
+    fill(episodes, [5] * 4, 11)
+    episodes.end_iteration()
+    assert {episode.mismatched for episode in episodes.replay} == expected and episodes.fresh == []
+
+
+def test_everything_is_replayed_if_nothing_is_mismatched():
+    episodes = make_episodes(n_mismatched=0)
+    fill(episodes, [5] * 4, 11)
+    episodes.end_iteration()
+    assert len(episodes.replay) == 8
+
+
+def test_oldest_episodes_leave_first_within_the_byte_budget():
+    episodes = make_episodes(keep="all", n_mismatched=0)
+    fill(episodes, [5] * 4, 51)
+    newest, size = episodes.fresh[-1], episodes.fresh[0].nbytes
+    episodes.max_bytes = 7 * size
+    episodes.end_iteration()
+    assert len(episodes.replay) == 7 and episodes.nbytes == 7 * size
+    assert episodes.replay[-1] is newest
+
+
+def test_an_episode_with_a_gap_is_dropped():
+    episodes = make_episodes()
+    episodes.add(observation([0] * 4, 0))
+    episodes.add(observation([2, 1, 1, 1], 1))  # environment 0 lost a decision
+    for step in range(2, 4):
+        episodes.add(observation([step + 1, step, step, step], step))
+    episodes.add(observation([0] * 4, 9))
+    assert sorted(episode.arrays["truth"][0, 0] for episode in episodes.fresh) == [1, 2, 3]
+
+
+def test_an_episode_longer_than_the_context_is_refused():
+    episodes = make_episodes(context_length=5)
+    with pytest.raises(ValueError, match=r"longer than the encoder's context of 5.*context_length"):
+        fill(episodes, [100] * 4, 6)
+
+
+def test_nothing_to_sample_before_the_first_end():
+    assert make_episodes().sample(10) is None
+
+
+def test_mismatched_environments_never_enter_the_loss():
+    buffer = USPLRolloutBuffer(
+        6, ToyEnv().observation_space, spaces.Box(-1, 1, (1,)), n_mismatched=2, n_envs=N_ENVS, gamma=0.9, gae_lambda=0.8
+    )
+    buffer.episodes = make_episodes()
+    for round_ in range(2):
+        buffer.reset()
+        for t in range(6):
+            values = th.arange(N_ENVS).float()
+            obs = observation([t] * 4, t)
+            buffer.add(obs, np.arange(N_ENVS)[:, None], np.arange(N_ENVS), np.zeros(N_ENVS), values, values)
+        buffer.compute_returns_and_advantage(th.zeros(N_ENVS), np.zeros(N_ENVS))
+        for _ in range(2):  # PPO passes over the buffer several times
+            samples = list(buffer.get(5))
+            truth = th.cat([sample.observations["truth"] for sample in samples]).flatten()
+            assert sorted(truth.tolist()) == [0.0] * 6 + [1.0] * 6
+            actions = th.cat([sample.actions for sample in samples]).flatten()
+            assert th.equal(actions, truth), round_
+    assert len(buffer.episodes.fresh) == N_ENVS  # the encoder gets them all
