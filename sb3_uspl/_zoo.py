@@ -10,6 +10,7 @@ try:
     import rl_zoo3.train
 except ImportError as error:  # pragma: no cover
     raise SystemExit(f'{error}. The command lines need the zoo: pip install -e ".[zoo]"') from error
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
@@ -21,7 +22,7 @@ from sb3_uspl import RMA, USPLPPO
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "zoo_configs"
 TRAINED_AGENTS = ROOT / "trained_agents"
-ALGORITHMS = {"uspl_ppo": USPLPPO, "rma": RMA}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"uspl_ppo": USPLPPO, "rma": RMA}
 
 EVALUATION_OFFSET = 500_000
 """The zoo seeds training and evaluation environments alike; ours are evaluated on other seeds than they are trained on."""
@@ -66,7 +67,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 def register() -> None:
     """Make ``--algo uspl_ppo``, ``--algo rma`` and our environments known to the zoo's commands."""
     rl_zoo3.ALGOS.update(ALGORITHMS)
-    rl_zoo3.train.ExperimentManager = ExperimentManager
+    rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
 
 
 def use_default_config() -> None:

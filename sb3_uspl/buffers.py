@@ -15,6 +15,11 @@ from sb3_uspl.encoder import Tokens
 from sb3_uspl.observations import COMMON, EPISODE_STEP, PREVIOUS_ACTION, PRIVILEGED, TARGET, TRUTH, policy_observation_space
 
 
+def _shape(space: spaces.Space) -> tuple[int, ...]:
+    assert space.shape is not None
+    return space.shape
+
+
 @dataclass
 class Episode:
     """
@@ -84,13 +89,13 @@ class EpisodeReplayBuffer:
         self.n_envs, self.n_mismatched = n_envs, n_mismatched
         self.context_length, self.max_bytes, self.keep = context_length, max_bytes, keep
         self.rng = np.random.default_rng(seed)
-        self._spec = {
-            COMMON: (observation_space[COMMON].shape, np.float32),
+        self._spec: dict[str, tuple[tuple[int, ...], Any]] = {
+            COMMON: (_shape(observation_space[COMMON]), np.float32),
             PREVIOUS_ACTION: ((n_action,), np.float32),
-            TRUTH: (observation_space[PRIVILEGED].shape, np.float32),
+            TRUTH: (_shape(observation_space[PRIVILEGED]), np.float32),
         }
         if TARGET in observation_space.spaces:
-            self._spec[TARGET] = (observation_space[TARGET].shape, observation_space[TARGET].dtype)  # type: ignore[assignment]
+            self._spec[TARGET] = (_shape(observation_space[TARGET]), observation_space[TARGET].dtype)  # type: ignore[assignment]
         self.replay: deque[Episode] = deque()
         self.fresh: list[Episode] = []
         self.nbytes = 0
@@ -163,9 +168,7 @@ class EpisodeReplayBuffer:
         :return: tokens ``(n_envs, longest, ...)`` and lengths ``(n_envs,)``
         """
         longest = max(int(self.lengths.max()), 1)
-        tokens = {
-            key: th.as_tensor(array[:, :longest], device=device) for key, array in self.running.items() if key != TRUTH
-        }
+        tokens = {key: th.as_tensor(array[:, :longest], device=device) for key, array in self.running.items() if key != TRUTH}
         return tokens, th.as_tensor(self.lengths, device=device)
 
     def collate(self, episodes: Sequence[Episode], device: th.device | str = "cpu") -> EpisodeBatch:
@@ -213,7 +216,12 @@ class USPLRolloutBuffer(DictRolloutBuffer):
     """
 
     def __init__(
-        self, buffer_size: int, observation_space: spaces.Dict, action_space: spaces.Space, n_mismatched: int = 0, **kwargs: Any
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        n_mismatched: int = 0,
+        **kwargs: Any,
     ):
         self.n_mismatched = n_mismatched
         self.n_collecting = kwargs.get("n_envs", 1)

@@ -14,7 +14,13 @@ from sb3_uspl.evaluation import EVALUATION_SEED, evaluate
 
 
 def load_agent(
-    algo: str, env_id: str, folder: str, exp_id: int = 0, best: bool = False, n_envs: int = 32, env_kwargs: dict[str, Any] | None = None
+    algo: str,
+    env_id: str,
+    folder: str,
+    exp_id: int = 0,
+    best: bool = False,
+    n_envs: int = 32,
+    env_kwargs: dict[str, Any] | None = None,
 ) -> tuple[BaseAlgorithm, VecEnv]:
     """
     Load an agent and its environments from the zoo's layout ``<folder>/<algo>/<env>_<exp_id>/``.
@@ -73,7 +79,13 @@ def main() -> None:
     env_kwargs = {"physics": arguments.physics} if arguments.physics else None
     try:
         model, venv = load_agent(
-            arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, arguments.n_envs, env_kwargs
+            arguments.algo,
+            arguments.env,
+            arguments.folder,
+            arguments.exp_id,
+            arguments.load_best,
+            arguments.n_envs,
+            env_kwargs,
         )
     except (AssertionError, ValueError) as error:
         raise SystemExit(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error

@@ -70,21 +70,21 @@ def run_episodes(
         wave = [EpisodeRecord(seed + first + i) for i in range(venv.num_envs)]
         alive = np.arange(venv.num_envs) < n_episodes - first
         venv.seed(seed + first)
-        obs = venv.reset()
-        assert isinstance(obs, dict)
-        infos: Sequence[dict[str, Any]] = venv.reset_infos
+        obs: Any = venv.reset()
+        infos: list[dict[str, Any]] = venv.reset_infos
         state: tuple[np.ndarray, ...] | None = None
         starts = np.ones(venv.num_envs, dtype=bool)
         while alive.any():
             actions, state = act(obs, state, starts)
-            for i in np.flatnonzero(alive):
+            for i in np.flatnonzero(alive).tolist():
                 wave[i].positions.append(np.asarray(infos[i].get("position", obs[COMMON][i])))
                 if isinstance(state, DeploymentState):
                     wave[i].truth.append(obs[PRIVILEGED][i].copy())
                     wave[i].belief_mean.append(state.belief_mean[i])
                     wave[i].belief_std.append(state.uncertainty[i])
             obs, rewards, starts, infos = venv.step(actions)  # type: ignore[assignment]
-            for i in np.flatnonzero(alive):
+            assert isinstance(obs, dict)
+            for i in np.flatnonzero(alive).tolist():
                 wave[i].reward += float(rewards[i])
                 if starts[i]:
                     wave[i].success = bool(infos[i].get("is_success", False))
@@ -93,7 +93,7 @@ def run_episodes(
     return records
 
 
-Act = Callable[[Any, Any, np.ndarray], tuple[np.ndarray, tuple[np.ndarray, ...] | None]]
+Act = Callable[[Any, Any, np.ndarray], tuple[np.ndarray, Any]]
 
 
 def _actor(model: BaseAlgorithm, policy: str, deterministic: bool, uncertainty: float | None) -> Act:
@@ -152,7 +152,9 @@ def mean_over_time(curves: Sequence[np.ndarray]) -> np.ndarray:
     return np.nanmean(padded, axis=0)
 
 
-def evaluate(model: BaseAlgorithm, venv: VecEnv, n_episodes: int, seed: int = EVALUATION_SEED, policy: str = "both") -> dict[str, Any]:
+def evaluate(
+    model: BaseAlgorithm, venv: VecEnv, n_episodes: int, seed: int = EVALUATION_SEED, policy: str = "both"
+) -> dict[str, Any]:
     """
     Success, return, length, PP-DP trajectory divergence and prediction error.
 
@@ -163,7 +165,11 @@ def evaluate(model: BaseAlgorithm, venv: VecEnv, n_episodes: int, seed: int = EV
     :param policy: "deployment", "privileged" or "both"
     :return: numbers by name, ready for JSON; what was not measured is None
     """
-    runs = {name: run_episodes(model, venv, n_episodes, seed, name) for name in ("deployment", "privileged") if policy in (name, "both")}
+    runs = {
+        name: run_episodes(model, venv, n_episodes, seed, name)
+        for name in ("deployment", "privileged")
+        if policy in (name, "both")
+    }
     result: dict[str, Any] = {"episodes": n_episodes, "seed": seed}
     for name, prefix in (("deployment", ""), ("privileged", "privileged_")):
         records = runs.get(name)

@@ -49,7 +49,9 @@ def check_observation_space(space: spaces.Space) -> spaces.Dict:
         if not isinstance(part, spaces.Box):
             raise ValueError(f"The space of '{key}' is {part}; it must be a Box (nested Dicts: flatten them first).")
         if len(part.shape) != 1 and not (key == TARGET and is_image_space(part)):
-            allowed = "one-dimensional, or a uint8 image of shape (channels, height, width)" if key == TARGET else "one-dimensional"
+            allowed = (
+                "one-dimensional, or a uint8 image of shape (channels, height, width)" if key == TARGET else "one-dimensional"
+            )
             raise ValueError(f"The space of '{key}' has the shape {part.shape} and dtype {part.dtype}; it must be {allowed}.")
         if part.shape[0] == 0:
             raise ValueError(f"The space of '{key}' is empty; it must have at least one dimension.")
@@ -127,13 +129,15 @@ class PrivilegedObservation(gym.ObservationWrapper):
         elif isinstance(space, spaces.Dict) and all(isinstance(part, spaces.Box) for part in space.values()):
             available = list(space.spaces)
         else:
-            raise ValueError(f"The observation space is {space}; PrivilegedObservation takes a one-dimensional Box or a flat Dict.")
+            raise ValueError(
+                f"PrivilegedObservation takes a one-dimensional Box or a flat Dict of boxes, not {space}."
+            )
         named = [*privileged, *target]
         unknown = [name for name in named if name not in available]
         if unknown or len(set(named)) != len(named) or not privileged:
             raise ValueError(
-                f"privileged={list(privileged)}, target={list(target)}: name at least one privileged part, and each part once, "
-                f"out of {available}."
+                f"privileged={list(privileged)}, target={list(target)}: name at least one privileged part, and each "
+                f"part once, out of {available}."
             )
         common = [name for name in available if name not in named]
         if not common:

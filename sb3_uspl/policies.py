@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 from torch import nn
 
-from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, reset_rows
+from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, reset_rows
 from sb3_uspl.observations import (
     BELIEF,
     COMMON,
@@ -52,6 +52,7 @@ class PolicyFeatures(BaseFeaturesExtractor):
     :param uncertainty_input: whether the uncertainty is seen
     :param mean_input: whether the encoder's mean is seen
     :param privileged_gain: factor on privileged values, whose scale is 0.2-0.25 by contract
+    :param normalize_common: whether the common observation is brought to zero mean and unit variance
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class PolicyFeatures(BaseFeaturesExtractor):
         uncertainty_input: bool,
         mean_input: bool,
         privileged_gain: float,
+        normalize_common: bool,
     ):
         n_privileged = get_flattened_obs_dim(observation_space[PRIVILEGED])
         n_common = get_flattened_obs_dim(observation_space[COMMON])
@@ -68,13 +70,14 @@ class PolicyFeatures(BaseFeaturesExtractor):
         self.privileged_key = privileged_key
         self.uncertainty_input, self.mean_input = uncertainty_input, mean_input
         self.privileged_gain = privileged_gain
+        self.common_normalizer = RunningNormalizer(n_common) if normalize_common else nn.Identity()
 
     def forward(self, obs: dict[str, th.Tensor]) -> th.Tensor:
         """
         :param obs: batch by key, ``(n, ...)``
         :return: ``(n, features_dim)``
         """
-        parts = [obs[COMMON], obs[self.privileged_key] * self.privileged_gain]
+        parts = [self.common_normalizer(obs[COMMON]), obs[self.privileged_key] * self.privileged_gain]
         if self.uncertainty_input:
             # Log scale, as the reward transformation: MIN_STD -> -1, INITIAL_STD -> 1.
             middle = 0.5 * (math.log(INITIAL_STD) + math.log(MIN_STD))
@@ -106,6 +109,8 @@ class USPLPolicy(ActorCriticPolicy):
     :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)
     :param mean_input: whether they also see the encoder's mean, as in the authors' release
     :param privileged_gain: factor that brings privileged values to unit scale
+    :param normalize_common: whether actor and critic see the common observation with zero mean and unit variance: a corridor's
+        width in units of the whole arena would otherwise take PPO long to notice
     :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
     :param kwargs: further arguments of ``ActorCriticPolicy``
     :raises ValueError: for a space outside the contract or an unknown preset
@@ -127,6 +132,7 @@ class USPLPolicy(ActorCriticPolicy):
         uncertainty_input: bool = True,
         mean_input: bool = True,
         privileged_gain: float = 4.0,
+        normalize_common: bool = True,
         smoothing: float = 0.0,
         **kwargs: Any,
     ):
@@ -140,7 +146,10 @@ class USPLPolicy(ActorCriticPolicy):
             smoothing=smoothing,
         )
         self.feature_arguments: dict[str, Any] = dict(
-            uncertainty_input=uncertainty_input, mean_input=mean_input, privileged_gain=privileged_gain
+            uncertainty_input=uncertainty_input,
+            mean_input=mean_input,
+            privileged_gain=privileged_gain,
+            normalize_common=normalize_common,
         )
         for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
             if kwargs.pop(name, None) not in (None, PolicyFeatures, {}, False):
@@ -159,7 +168,8 @@ class USPLPolicy(ActorCriticPolicy):
         # Built after super().__init__, whose optimizer must not hold the encoder.
         self.smoothing = smoothing
         n_action = get_flattened_obs_dim(action_space)
-        self.encoder = ObservationEncoder(self.contract, n_action, encoder, memory, encoder_kwargs)
+        with th.random.fork_rng(devices=[]):  # leaves the random numbers of the actions as they are in stock PPO
+            self.encoder = ObservationEncoder(self.contract, n_action, encoder, memory, encoder_kwargs)
         self.encoder_optimizer = th.optim.AdamW(
             self.encoder.parameters(), lr=encoder_learning_rate, weight_decay=encoder_weight_decay
         )
@@ -185,6 +195,16 @@ class USPLPolicy(ActorCriticPolicy):
     def _only_policy_keys(obs: PyTorchObs) -> PyTorchObs:
         assert isinstance(obs, dict)
         return {key: obs[key] for key in POLICY_KEYS}
+
+    def update_normalizers(self, common: np.ndarray) -> None:
+        """
+        Let actor and critic know more common observations; between PPO's updates only, which compare old and new policy.
+
+        :param common: ``(n_samples, n_common)``
+        """
+        for features in (self.pi_features_extractor, self.vf_features_extractor):
+            if isinstance(features.common_normalizer, RunningNormalizer):
+                features.common_normalizer.update(th.as_tensor(common, dtype=th.float32, device=self.device))
 
     def set_action_std(self, std: float) -> None:
         """
@@ -256,7 +276,7 @@ class USPLPolicy(ActorCriticPolicy):
             tensors = {key: th.as_tensor(value.copy(), device=self.device) for key, value in obs.items()}
             distribution = self.get_distribution({COMMON: tokens[COMMON], **tensors})
             actions = distribution.get_actions(deterministic=deterministic).cpu().numpy()
-        actions = actions.reshape((n_envs, *self.action_space.shape))  # type: ignore[misc]
+        actions = actions.reshape((n_envs, *self.action_space.shape))  # type: ignore[misc, arg-type]
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
         encoded = preprocess_obs(th.as_tensor(actions), self.action_space, normalize_images=False)
@@ -276,7 +296,9 @@ class USPLPolicy(ActorCriticPolicy):
         keys = [key for key in (COMMON, TARGET) if key in self.contract.spaces]
         missing = [key for key in keys if key not in observation]
         if missing:
-            raise ValueError(f"The observation has the keys {sorted(observation)}; the deployment policy also needs {missing}.")
+            raise ValueError(
+                f"The observation has the keys {sorted(observation)}; the deployment policy also needs {missing}."
+            )
         arrays = {key: np.asarray(observation[key]) for key in keys}
         check_finite(arrays)
         vectorized = is_vectorized_observation(arrays[COMMON], self.contract[COMMON])
@@ -299,7 +321,12 @@ class USPLPolicy(ActorCriticPolicy):
                 f"The state holds {len(std)} environments but {n_envs} observations were given: pass the state that predict "
                 "returned for the same environments, or None to start anew."
             )
-        return mean, std.copy(), previous_action.copy(), tuple(th.as_tensor(part.copy(), device=self.device) for part in memory)
+        return (
+            mean,
+            std.copy(),
+            previous_action.copy(),
+            tuple(th.as_tensor(part.copy(), device=self.device) for part in memory),
+        )
 
 
 class USPLCnnPolicy(USPLPolicy):

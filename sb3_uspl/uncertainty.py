@@ -1,4 +1,4 @@
-"""The paper's equations as pure functions of arrays (Eq. 2-4 and App. C.3.1). Eq. 1 is :func:`sb3_uspl.encoder.gaussian_nll`."""
+"""Eq. 2-4 and App. C.3.1 as pure functions of arrays. Eq. 1 is :func:`sb3_uspl.encoder.gaussian_nll`."""
 
 import math
 

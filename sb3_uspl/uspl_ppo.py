@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.encoder import gaussian_nll
-from sb3_uspl.observations import PRIVILEGED, check_observation_space
+from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
 from sb3_uspl.uncertainty import C_MAX, C_MIN, DELTA, smoothing_factor
@@ -39,8 +39,8 @@ class USPLPPO(PPO):
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``USPLPolicy``
     :param env: environment under the observation contract (see ``sb3_uspl.observations``)
-    :param learning_rate: of actor and critic. A number falls along a cosine to ``learning_rate_floor`` of itself by the end of
-        training (App. C.3.1); a schedule is used as it is. Paper: 1e-4 (actor), 5e-4 (critic) with Adam; SB3 has one optimizer.
+    :param learning_rate: of actor and critic. A number falls along a cosine to ``learning_rate_floor`` of itself by the end
+        of training (App. C.3.1); a schedule is used as it is. Paper: 1e-4 (actor), 5e-4 (critic); SB3 has one optimizer.
     :param n_steps: decisions per environment and rollout
     :param batch_size: minibatch of PPO
     :param n_epochs: passes of PPO over a rollout
@@ -280,7 +280,9 @@ class USPLPPO(PPO):
             raise ValueError(f"blur_noise='{self.blur_noise}': choose 'uniform' or 'gaussian'.")
         for dim, values in self.discrete_privileged.items():
             if not 0 <= dim < space.shape[0]:
-                raise ValueError(f"discrete_privileged names dimension {dim}, but the privileged observation has {space.shape[0]}.")
+                raise ValueError(
+                    f"discrete_privileged names dimension {dim}, but the privileged observation has {space.shape[0]}"
+                )
             if len(set(values)) < 2 or min(values) < space.low[dim] - 1e-6 or max(values) > space.high[dim] + 1e-6:
                 raise ValueError(
                     f"discrete_privileged={{{dim}: {values}}}: give at least two different values within the bounds "
@@ -290,8 +292,8 @@ class USPLPPO(PPO):
         bounded = np.isfinite(space.low[continuous]) & np.isfinite(space.high[continuous])
         if self.blur and self.blur_noise == "uniform" and not bounded.all():
             raise ValueError(
-                f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give them "
-                "finite bounds, or use blur_noise='gaussian'."
+                f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give "
+                "them finite bounds, or use blur_noise='gaussian'."
             )
         ranges = {
             "warmup_timesteps": (self.warmup_timesteps or 0, 0, np.inf),
@@ -321,9 +323,9 @@ class USPLPPO(PPO):
         needed = int(np.ceil(1.5 / fraction))
         if automatic:
             warnings.warn(
-                f"{self.n_envs} environment(s) are too few to set some apart with mismatched privileged observations, without "
-                f"which the encoder may learn to read the goal off the policy's behaviour (App. C.3.1). Use at least {needed}, "
-                "or silence this with mismatch_fraction=0."
+                f"{self.n_envs} environment(s) are too few to give some a mismatched privileged observation, without which "
+                "the encoder may learn to read it off the policy's behaviour (App. C.3.1). Use at least "
+                f"{needed}, or silence this with mismatch_fraction=0."
             )
             return 0
         raise ValueError(
@@ -389,7 +391,7 @@ class USPLPPO(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        # `model.env` stays what the user gave (callbacks, VecNormalize and set_env rely on it); only experience is transformed.
+        # `model.env` stays what the user gave (callbacks, VecNormalize, set_env rely on it); only experience is transformed.
         wrapper = self._rollout_env
         assert wrapper is not None and env is self.env
         wrapper.progress = self.progress
@@ -406,6 +408,7 @@ class USPLPPO(PPO):
     def train(self) -> None:
         """PPO's update, then the encoder's (Alg. 1, lines 12 and 13)."""
         super().train()
+        self.policy.update_normalizers(self.rollout_buffer.observations[COMMON])
         wrapper, episodes = self._rollout_env, self.rollout_buffer.episodes
         assert wrapper is not None and episodes is not None
         for name, values in wrapper.metrics.items():

@@ -10,9 +10,9 @@ from sb3_uspl.uspl_ppo import USPLPPO
 
 class RMA(USPLPPO):
     """
-    USPL without its three parts: the policy sees the exact privileged observation and no uncertainty, the reward is the task's.
+    USPL without its three parts: an exact privileged observation, no uncertainty input, the task's own reward.
 
-    Sampling, networks, encoder and mismatched episodes stay the same, so a difference to ``USPLPPO`` is a difference in method.
+    Sampling, networks, encoder and mismatched episodes stay the same, so any difference to ``USPLPPO`` is one of method.
 
     :param policy: as for ``USPLPPO``
     :param env: as for ``USPLPPO``
@@ -31,6 +31,4 @@ class RMA(USPLPPO):
         uncertainty_input: bool = False,
         **kwargs: Any,
     ):
-        super().__init__(
-            policy, env, blur=blur, reward_scaling=reward_scaling, uncertainty_input=uncertainty_input, **kwargs
-        )
+        super().__init__(policy, env, blur=blur, reward_scaling=reward_scaling, uncertainty_input=uncertainty_input, **kwargs)

@@ -93,11 +93,14 @@ class ObservationEncoder(nn.Module):
         super().__init__()
         if preset not in PRESETS or memory not in MEMORIES:
             raise ValueError(
-                f"encoder='{preset}' with memory='{memory}': the presets are {sorted(PRESETS)}, the memories {sorted(MEMORIES)}."
+                f"encoder='{preset}' with memory='{memory}': the presets are {sorted(PRESETS)}, "
+                f"the memories {sorted(MEMORIES)}."
             )
         unknown = set(overrides or {}) - set(PRESETS[preset])
         if unknown:
-            raise ValueError(f"encoder_kwargs has unknown entries {sorted(unknown)}; it may replace {sorted(PRESETS[preset])}.")
+            raise ValueError(
+                f"encoder_kwargs has unknown entries {sorted(unknown)}; it may replace {sorted(PRESETS[preset])}."
+            )
         sizes = {**PRESETS[preset], **(overrides or {})}
         n_privileged = space[PRIVILEGED].shape[0]  # type: ignore[index]
         self.features = TokenFeatures(space, n_action, sizes["hidden"], sizes["trunk"])

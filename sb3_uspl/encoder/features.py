@@ -95,7 +95,9 @@ class DepthCNN(nn.Module):
         )
         with th.no_grad():
             n_flat = self.convolutions(th.zeros(1, *space.shape)).shape[1]
-        self.fully_connected = nn.Sequential(nn.Linear(n_flat, self.WIDTH), nn.ELU(), nn.Linear(self.WIDTH, self.WIDTH), nn.Tanh())
+        self.fully_connected = nn.Sequential(
+            nn.Linear(n_flat, self.WIDTH), nn.ELU(), nn.Linear(self.WIDTH, self.WIDTH), nn.Tanh()
+        )
 
     def forward(self, images: th.Tensor) -> th.Tensor:
         """

@@ -81,7 +81,7 @@ class GRUMemory(Memory):
         self.gru = nn.GRU(width, width, batch_first=True)
 
     def initial_state(self, n_envs: int) -> MemoryState:
-        return (th.zeros(n_envs, self.width, device=self.gru.weight_hh_l0.device),)
+        return (th.zeros(n_envs, self.width, device=next(self.parameters()).device),)
 
     def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
         outputs, _ = self.gru(features)
@@ -115,7 +115,9 @@ class TransformerMemory(Memory):
     def __init__(self, width: int, n_heads: int = 4, head_width: int = 32, n_layers: int = 1, dropout: float = 0.0):
         super().__init__(width)
         self.n_heads, self.head_width, self.n_layers = n_heads, head_width, n_layers
-        self.blocks = nn.ModuleList(_Block(width, n_heads, head_width, dropout) for _ in range(n_layers))
+        self.blocks: list[_Block] = nn.ModuleList(  # type: ignore[assignment]
+            _Block(width, n_heads, head_width, dropout) for _ in range(n_layers)
+        )
         self.norm = nn.RMSNorm(width)
         self.out = nn.Linear(width, width)
         slopes = 2.0 ** (-8.0 * th.arange(1, n_heads + 1) / n_heads)
@@ -162,7 +164,9 @@ class TransformerMemory(Memory):
             q, k, v = block.project(features)
             keys[rows, index, :, length] = k[:, :, 0]
             values[rows, index, :, length] = v[:, :, 0]
-            attended = F.scaled_dot_product_attention(q, keys[:, index, :, :n_tokens], values[:, index, :, :n_tokens], attn_mask=bias)
+            attended = F.scaled_dot_product_attention(
+                q, keys[:, index, :, :n_tokens], values[:, index, :, :n_tokens], attn_mask=bias
+            )
             features = block.finish(features, attended)
         return self.out(self.norm(features))[:, 0], (keys, values, length + 1)
 

@@ -4,6 +4,6 @@ import gymnasium as gym
 
 from sb3_uspl.envs.target_reaching import TargetReachingEnv
 
-gym.register("TargetReaching-v0", entry_point=TargetReachingEnv, max_episode_steps=TargetReachingEnv.MAX_STEPS)
+gym.register("TargetReaching-v0", entry_point="sb3_uspl.envs:TargetReachingEnv", max_episode_steps=TargetReachingEnv.MAX_STEPS)
 
 __all__ = ["TargetReachingEnv"]

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import gymnasium
 import numpy as np
 
+from bullet_tasks.tasks.navigation import MAX_TURN
+
 Policy = Callable[[dict[str, np.ndarray]], np.ndarray]
 
 POSITION_SCALE = 8.0  # m, of the pose in `common`
@@ -34,7 +36,7 @@ def walk(observation: dict[str, np.ndarray], direction: float) -> np.ndarray:
     _, y, cos_yaw, sin_yaw = map(float, observation["common"])
     heading = math.atan2(-y * POSITION_SCALE, direction * LOOK_AHEAD)
     turn = math.remainder(heading - math.atan2(sin_yaw, cos_yaw), math.tau)
-    return np.array([turn / math.pi], dtype=np.float32)
+    return np.array([max(-1.0, min(1.0, turn / MAX_TURN))], dtype=np.float32)
 
 
 def informed(observation: dict[str, np.ndarray]) -> np.ndarray:

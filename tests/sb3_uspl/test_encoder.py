@@ -1,5 +1,6 @@
 """The encoder: cached steps equal whole episodes, Eq. 1 by hand, sizes of the presets."""
 
+import itertools
 import math
 
 import numpy as np
@@ -44,7 +45,7 @@ def test_steps_equal_whole_episodes_across_resets_and_cache_growth(name):
         outputs = th.stack(outputs, 1)
         for env, times in resets.items():
             edges = [0, *times, n_tokens]
-            for start, stop in zip(edges[:-1], edges[1:], strict=True):
+            for start, stop in itertools.pairwise(edges):
                 whole, _ = memory(features[env : env + 1, start:stop], th.tensor([stop - start]))
                 th.testing.assert_close(outputs[env, start:stop], whole[0], atol=1e-5, rtol=1e-4)
 
@@ -163,4 +164,4 @@ def test_either_memory_learns_what_was_revealed_and_says_when(memory):
         th.nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)
         optimizer.step()
     std = encoder(tokens, lengths)[0].std.mean(0)[:, 0]
-    assert (std[:2] > 0.2).all() and (std[3:] < 0.1).all()
+    assert std[:2].min() > 3 * std[3:].max()

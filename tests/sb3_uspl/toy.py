@@ -15,7 +15,10 @@ class ToyEnv(gym.Env):
     def __init__(self, length=8, target=None, action_space=None, n_privileged=1, terminate=False, bounded=True):
         self.length, self.terminate = length, terminate
         limit = 0.25 if bounded else np.inf
-        parts = {"common": spaces.Box(-1, 1, (2,), np.float32), "privileged": spaces.Box(-limit, limit, (n_privileged,), np.float32)}
+        parts = {
+            "common": spaces.Box(-1, 1, (2,), np.float32),
+            "privileged": spaces.Box(-limit, limit, (n_privileged,), np.float32),
+        }
         if target is not None:
             parts["target"] = target
         self.observation_space = spaces.Dict(parts)

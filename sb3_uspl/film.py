@@ -1,0 +1,288 @@
+"""Films of the deployment policy: what the robot does beside what it believes. Needs matplotlib (extra ``zoo``)."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Ellipse, Patch, Polygon, Rectangle
+from PIL import Image
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from bullet_tasks.scene import SceneSpec
+from bullet_tasks.shapes import Box, Shape
+from sb3_uspl.observations import PRIVILEGED
+from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR, on_map
+from sb3_uspl.policies import DeploymentState, USPLPolicy
+
+FRAMES_PER_SECOND = 8.0
+"""Decisions a second in the film; twice real time for decisions of 0.25 s."""
+FIRST_FRAME_TIME, LAST_FRAME_TIME = 1.0, 2.5
+"""s for which the beginning and the end of an episode stand still."""
+GIF_COLOURS = 96
+_WIDTH, _DPI = 10.0, 90
+_ROW_HEIGHT = {True: 4.1, False: 3.7}  # inches an agent, by whether the panels lie one above the other
+_WIDE = 2.0  # ratio of width to height from which the picture lies above the map instead of beside it
+_PARKED_HEIGHT = -50.0  # m; shapes below are out of use in this episode
+_MARGIN = 0.5  # m around the scene
+_OPEN_FIELD = ((-1.0, -1.0), (1.0, 1.0))  # the map of an environment without a scene, in its own unit
+_LEAST_THICKNESS, _ROBOT_LENGTH = 0.025, 0.045  # share of the map's width
+_GROUND, _REACHED, _FAILED, _ERROR_COLOUR = "#3b4452", "#1b7f3b", "#b3261e", "#333333"
+
+
+@dataclass
+class Clip:
+    """One episode of a deployment policy, at every decision and once after the last one."""
+
+    seed: int
+    scene: SceneSpec | None
+    goal: np.ndarray
+    """On the map, ``(2,)``."""
+    success: bool = False
+    poses: list[tuple[float, float, float]] = field(default_factory=list)
+    """x, y (m) and yaw (rad)."""
+    centres: list[np.ndarray] = field(default_factory=list)
+    half_widths: list[np.ndarray] = field(default_factory=list)
+    sigmas: list[float] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+    pictures: list[np.ndarray] = field(default_factory=list)
+    """Of ``env.render()``; empty if the environment gives none."""
+
+
+def record_clip(model: BaseAlgorithm, env: gym.Env, seed: int) -> Clip:
+    """
+    Run one episode of the deployment policy, deterministic.
+
+    :param model: with a ``USPLPolicy``
+    :param env: with ``belief_in_world``, itself or its task
+    :param seed: of the episode
+    :return: the episode
+    :raises ValueError: if the model has no belief
+    """
+    policy = model.policy
+    world: Any = env.unwrapped
+    if not isinstance(policy, USPLPolicy):
+        raise ValueError(f"{type(model).__name__} has no observation encoder, so there is no belief to film.")
+    task = getattr(world, "task", world)
+    obs, info = env.reset(seed=seed)
+    goal = task.goal if hasattr(task, "goal") else task.belief_in_world(obs[PRIVILEGED], np.zeros_like(obs[PRIVILEGED]))[0]
+    clip = Clip(seed, getattr(world, "scene", None), np.asarray(goal))
+    state: DeploymentState | None = None
+    over = False
+    while True:
+        action, state = policy.act(obs, state, deterministic=True)  # type: ignore[arg-type]
+        centre, half_widths, sigma, error = on_map(
+            task.belief_in_world, state.belief_mean[0], state.uncertainty[0], obs[PRIVILEGED]
+        )
+        clip.poses.append(_pose(world, info, clip.poses))
+        clip.centres.append(centre)
+        clip.half_widths.append(half_widths)
+        clip.sigmas.append(sigma)
+        clip.errors.append(error)
+        if env.render_mode == "rgb_array":
+            clip.pictures.append(env.render())  # type: ignore[arg-type]
+        if over:
+            clip.success = bool(info.get("is_success", False))
+            return clip
+        obs, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+
+
+def _pose(world: Any, info: dict[str, Any], before: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
+    x, y = map(float, info["position"])
+    if hasattr(world, "robot"):
+        return x, y, world.robot.state.yaw
+    # A point has no heading: it looks where it goes.
+    if not before or (x, y) == before[-1][:2]:
+        return x, y, before[-1][2] if before else 0.0
+    return x, y, math.atan2(y - before[-1][1], x - before[-1][0])
+
+
+def film(agents: Mapping[str, BaseAlgorithm], env: gym.Env, seeds: Sequence[int], out: Path) -> list[Clip]:
+    """
+    Film the deployment policies of one or several agents, one above the other, on the same episodes.
+
+    An episode of n decisions gives n + 1 frames; if one agent is done earlier its last frame stays until the others are.
+
+    :param agents: models with a ``USPLPolicy``, by the name to show
+    :param env: with ``belief_in_world``; made with ``render_mode="rgb_array"`` its picture is shown as well
+    :param seeds: of the episodes, shown one after the other
+    :param out: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg)
+    :return: the episodes: for each seed those of all agents
+    :raises ValueError: for another file type, without an agent or seed, or if an agent has no belief
+    """
+    if out.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"{out}: a film is a .gif or a .mp4 file.")
+    if not agents or not seeds:
+        raise ValueError("A film needs at least one agent and one seed.")
+    period = float(env.get_wrapper_attr("decision_period"))
+    frames: list[np.ndarray] = []
+    times: list[float] = []
+    recorded: list[Clip] = []
+    for seed in seeds:
+        clips = {name: record_clip(model, env, seed) for name, model in agents.items()}
+        episode = list(_draw(clips, period))
+        frames += episode
+        times += [FIRST_FRAME_TIME, *([1.0 / FRAMES_PER_SECOND] * (len(episode) - 2)), LAST_FRAME_TIME]
+        recorded += clips.values()
+    (_write_gif if out.suffix == ".gif" else _write_mp4)(frames, times, out)
+    return recorded
+
+
+def _draw(clips: Mapping[str, Clip], period: float) -> Iterator[np.ndarray]:
+    """Frames, uint8 ``(height, width, 3)``."""
+    first = next(iter(clips.values()))
+    ratio = first.pictures[0].shape[1] / first.pictures[0].shape[0] if first.pictures else 1.0
+    figure = Figure(figsize=(_WIDTH, _ROW_HEIGHT[ratio > _WIDE] * len(clips)), dpi=_DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    end = period * max(len(clip.poses) - 1 for clip in clips.values())
+    highest = 1.15 * max(max(clip.sigmas + clip.errors) for clip in clips.values())
+    rows = figure.subfigures(len(clips), 1, squeeze=False)[:, 0]
+    stages = [
+        _Stage(row, name, clip, period, (end, highest), ratio > _WIDE)
+        for row, (name, clip) in zip(rows, clips.items(), strict=True)
+    ]
+    # Once, so that the panels stand still.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for frame in range(max(len(clip.poses) for clip in clips.values())):
+        for stage in stages:
+            stage.show(frame)
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+class _Stage:
+    """
+    The panels of one agent: picture, map and belief over time.
+
+    :param row: where to draw
+    :param name: of the agent
+    :param clip: its episode
+    :param period: s per decision
+    :param limits: of the plot over time, s and m
+    :param wide: whether picture and map lie one above the other
+    """
+
+    def __init__(self, row: SubFigure, name: str, clip: Clip, period: float, limits: tuple[float, float], wide: bool):
+        self.row, self.name, self.clip, self.period = row, name, clip, period
+        shown = ("picture", "map") if clip.pictures else ("map",)
+        layout = [[panel, "time"] for panel in shown] if wide else [[*shown, "time"]]
+        ratios = (2.6, 1.0) if wide else [1.0] * len(layout[0])
+        axes = row.subplot_mosaic(layout, width_ratios=ratios)  # type: ignore[arg-type]
+        self.title = row.suptitle(" ", fontweight="bold", fontsize="large")
+        if clip.pictures:
+            axes["picture"].set_axis_off()
+            self.image = axes["picture"].imshow(clip.pictures[0])
+        self._draw_map(axes["map"])
+        self._draw_time(axes["time"], limits)
+
+    def _draw_map(self, axis: Axes) -> None:
+        scene, unit = self.clip.scene, "" if self.clip.scene is None else " (m)"
+        shapes = [shape for shape in scene.shapes if shape.top > _PARKED_HEIGHT] if scene is not None else []
+        for shape in sorted(shapes, key=lambda shape: shape.top):
+            axis.add_patch(_footprint(shape))
+        if scene is not None and math.isfinite(scene.lower_ground):
+            axis.set_facecolor(_GROUND)
+        corners = np.array([_extent(shape) for shape in shapes]) if shapes else np.array([_OPEN_FIELD])
+        (left, bottom), (right, top) = corners[:, 0].min(axis=0) - _MARGIN, corners[:, 1].max(axis=0) + _MARGIN
+        axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x" + unit, ylabel="y" + unit)
+        self.size = right - left
+        self.belief = Ellipse((0.0, 0.0), 1.0, 1.0, facecolor=SIGMA_COLOUR, edgecolor=SIGMA_COLOUR, alpha=0.55, linewidth=2.0)
+        axis.add_patch(self.belief)
+        (self.path,) = axis.plot([], [], color=DEPLOYMENT_COLOUR, linewidth=1.8, zorder=4)
+        self.robot = Polygon(np.zeros((3, 2)), facecolor=DEPLOYMENT_COLOUR, edgecolor="white", linewidth=1.0, zorder=6)
+        axis.add_patch(self.robot)
+        star = dict(marker="*", markersize=15, color="gold", markeredgecolor="black", linestyle="")
+        axis.plot(*self.clip.goal, zorder=5, **star)  # type: ignore[arg-type]
+        handles = [
+            Line2D([], [], marker=">", color=DEPLOYMENT_COLOUR, markersize=8, label="robot and its path"),
+            Line2D([], [], label="goal (hidden from it)", **star),  # type: ignore[arg-type]
+            Patch(color=SIGMA_COLOUR, alpha=0.55, label="where it believes the goal is (±1 $\\sigma$)"),
+        ]
+        axis.legend(
+            handles=handles, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small", frameon=False,
+            columnspacing=1.2, handletextpad=0.5,
+        )  # fmt: skip
+
+    def _draw_time(self, axis: Axes, limits: tuple[float, float]) -> None:
+        unit = "" if self.clip.scene is None else " (m)"
+        (self.sigma,) = axis.plot([], [], color=SIGMA_COLOUR, linewidth=2.2, label=r"uncertainty $\sigma$")
+        (self.error,) = axis.plot([], [], "--", color=_ERROR_COLOUR, linewidth=1.6, label="|belief - truth|")
+        self.now = axis.axvline(0.0, color="0.6", linewidth=1.0)
+        axis.set(xlim=(0.0, max(limits[0], self.period)), ylim=(0.0, limits[1]), xlabel="time (s)", ylabel="belief" + unit)
+        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False)
+        axis.grid(alpha=0.25)
+
+    def show(self, frame: int) -> None:
+        """
+        Draw a moment of the episode.
+
+        :param frame: decisions so far
+        """
+        clip, last = self.clip, len(self.clip.poses) - 1
+        now = min(frame, last)
+        if clip.pictures:
+            self.image.set_data(clip.pictures[now])
+        x, y, yaw = clip.poses[now]
+        self.path.set_data(*np.array(clip.poses[: now + 1])[:, :2].T)
+        length = _ROBOT_LENGTH * self.size
+        corners = length * np.array([(0.6, 0.0), (-0.4, 0.4), (-0.4, -0.4)])
+        turn = np.array([(math.cos(yaw), math.sin(yaw)), (-math.sin(yaw), math.cos(yaw))])
+        self.robot.set_xy(corners @ turn + (x, y))
+        self.belief.set_center(tuple(clip.centres[now]))
+        thickness = _LEAST_THICKNESS * self.size
+        self.belief.width, self.belief.height = (max(2.0 * float(half), thickness) for half in clip.half_widths[now])
+        time = self.period * np.arange(now + 1)
+        self.sigma.set_data(time, clip.sigmas[: now + 1])
+        self.error.set_data(time, clip.errors[: now + 1])
+        self.now.set_xdata([time[-1], time[-1]])
+        outcome, colour = ("reached the goal", _REACHED) if clip.success else ("failed", _FAILED)
+        text = f"{outcome} after" if now == last else "running,"
+        self.title.set_text(f"{self.name}, deployment policy, seed {clip.seed}: {text} {time[-1]:.1f} s")
+        self.title.set_color(colour if now == last else "black")
+
+
+def _footprint(shape: Shape) -> Patch:
+    x, y, _ = shape.centre
+    if not isinstance(shape, Box):
+        return Circle((x, y), shape.radius, facecolor=shape.colour)
+    a, b, _ = shape.half_extents
+    return Rectangle(
+        (x - a, y - b), 2 * a, 2 * b, angle=math.degrees(shape.yaw), rotation_point="center", facecolor=shape.colour
+    )
+
+
+def _extent(shape: Shape) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lower left and upper right corner of what surely holds the shape if it is not turned."""
+    a, b = shape.half_extents[:2] if isinstance(shape, Box) else (shape.radius, shape.radius)
+    return (shape.centre[0] - a, shape.centre[1] - b), (shape.centre[0] + a, shape.centre[1] + b)
+
+
+def _write_gif(frames: Sequence[np.ndarray], times: Sequence[float], out: Path) -> None:
+    """One palette for all frames, without dithering: then frames differ only where something moves."""
+    images = [Image.fromarray(frame) for frame in frames]
+    samples = [images[0], images[len(images) // 2], images[-1]]
+    montage = Image.new("RGB", (images[0].width, sum(image.height for image in samples)))
+    for i, image in enumerate(samples):
+        montage.paste(image, (0, i * images[0].height))
+    palette = montage.quantize(GIF_COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first.save(out, save_all=True, append_images=others, duration=[round(1000 * time) for time in times], loop=0)
+
+
+def _write_mp4(frames: Sequence[np.ndarray], times: Sequence[float], out: Path) -> None:
+    """Still frames are repeated; H.264 wants even sizes."""
+    import imageio.v2 as imageio
+
+    with imageio.get_writer(out, fps=FRAMES_PER_SECOND, macro_block_size=2) as writer:
+        for frame, time in zip(frames, times, strict=True):
+            for _ in range(round(time * FRAMES_PER_SECOND)):
+                writer.append_data(frame)  # type: ignore[attr-defined]

@@ -1,0 +1,370 @@
+"""USPLPPO as an SB3 user meets it, and the laws that tie it to PPO."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_uspl import RMA, USPLPPO, MlpPolicy
+from tests.sb3_uspl.toy import IMAGE, ToyEnv
+
+FAST = dict(n_steps=16, batch_size=32, n_epochs=2, encoder_updates=2, encoder_batch_size=64, seed=0)
+
+
+def make_venv(n_envs=8, seed=0, **kwargs):
+    return make_vec_env(ToyEnv, n_envs, seed=seed, env_kwargs=kwargs)
+
+
+def make_model(n_envs=8, policy="MlpPolicy", algorithm=USPLPPO, env_kwargs=None, **kwargs):
+    return algorithm(policy, make_venv(n_envs, **(env_kwargs or {})), **{**FAST, **kwargs})
+
+
+def parameters(model):
+    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+def assert_equal_parameters(a, b, only=""):
+    names = [name for name in a if name.startswith(only)]
+    assert names and all(th.equal(a[name], b[name]) for name in names)
+
+
+# -- the same as PPO ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("action_space", [spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(3)], ids=["box", "discrete"])
+def test_with_everything_off_it_is_stock_ppo(action_space):
+    """Same seed, same networks, same samples, same updates: the actor's and critic's weights are identical."""
+    common = dict(n_steps=16, batch_size=32, n_epochs=2, seed=3, gamma=0.9)
+    kwargs = dict(action_space=action_space, terminate=False)  # time-outs: bootstrapping has to agree too
+    stock = PPO("MultiInputPolicy", make_venv(4, 3, **kwargs), policy_kwargs=dict(net_arch=[32]), **common)
+    stock.learn(4 * 16 * 4)  # before the other model is built, as both draw from the same generator
+    ours = USPLPPO(
+        "MlpPolicy",
+        make_venv(4, 3, **kwargs),
+        learning_rate_floor=1.0,
+        action_std=None,
+        blur=False,
+        reward_scaling=False,
+        uncertainty_input=False,
+        mismatch_fraction=0.0,
+        encoder_batch_size=64,
+        policy_kwargs=dict(net_arch=[32], activation_fn=th.nn.Tanh, privileged_gain=1.0, normalize_common=False),
+        **common,
+    )
+    ours.learn(4 * 16 * 4)
+    theirs = stock.policy.state_dict()
+    mine = ours.policy.state_dict()
+    for name in theirs:
+        th.testing.assert_close(mine[name], theirs[name], msg=name)
+    np.testing.assert_allclose(stock.rollout_buffer.returns, ours.rollout_buffer.returns, rtol=1e-5)
+    np.testing.assert_array_equal(stock.rollout_buffer.actions, ours.rollout_buffer.actions)
+    assert ours.policy.encoder_optimizer.state  # the encoder did learn meanwhile
+
+
+@pytest.mark.parametrize("algorithm", [USPLPPO, RMA])
+def test_same_seed_same_run(algorithm):
+    runs = [make_model(algorithm=algorithm, warmup_timesteps=128, ramp_timesteps=128).learn(512) for _ in range(2)]
+    assert_equal_parameters(parameters(runs[0]), parameters(runs[1]))
+    other = make_model(algorithm=algorithm, **{"seed": 1}).learn(512)
+    assert any(not th.equal(a, b) for a, b in zip(parameters(runs[0]).values(), parameters(other).values(), strict=True))
+
+
+# -- separation of the two learners ------------------------------------------------------------------------------------------
+
+
+def test_ppo_and_encoder_never_touch_each_others_weights():
+    model = make_model()
+    model.learn(256)
+    encoder_ids = {id(parameter) for parameter in model.policy.encoder.parameters()}
+    held_by_ppo = {id(parameter) for group in model.policy.optimizer.param_groups for parameter in group["params"]}
+    assert not encoder_ids & held_by_ppo
+    # Left-over gradients would enter PPO's clipping of the whole policy.
+    assert all(parameter.grad is None for parameter in model.policy.encoder.parameters())
+
+    before = parameters(model)
+    PPO.train(model)
+    assert_equal_parameters(before, parameters(model), "encoder.")
+    assert all(parameter.grad is None for parameter in model.policy.encoder.parameters())
+
+    before = parameters(model)
+    model._train_encoder(model.rollout_buffer.episodes)
+    after = parameters(model)
+    assert_equal_parameters(before, after, "mlp_extractor.")
+    assert_equal_parameters(before, after, "action_net.")
+    assert any(not th.equal(before[name], after[name]) for name in before if name.startswith("encoder."))
+
+
+def test_no_encoder_updates_in_warmup_if_asked_so():
+    model = make_model(encoder_warmup=False, warmup_timesteps=10_000)
+    before = parameters(model)
+    model.learn(256)
+    assert_equal_parameters(before, parameters(model), "encoder.")
+
+
+def test_schedules_reach_their_ends():
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            seen.append((self.model.progress, self.model.policy.log_std.exp().item()))
+
+    model = make_model(warmup_timesteps=256, ramp_timesteps=256, action_std=0.4, action_std_floor=0.25)
+    model.learn(1024, callback=Watch())
+    progress, stds = zip(*seen, strict=True)
+    assert progress[:3] == (0.0, 0.0, 0.0) and progress[3] == pytest.approx(0.5) and progress[4:] == (1.0,) * 4
+    assert all(a >= b for a, b in itertools.pairwise(stds)) and stds[0] > 0.39 and stds[-1] > 0.1
+
+
+# -- deployment --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("memory", ["gru", "transformer"])
+@pytest.mark.parametrize("target", [None, IMAGE], ids=["blind", "image"])
+def test_deployment_policy_ignores_privileged(memory, target):
+    policy = "CnnPolicy" if target is IMAGE else "MlpPolicy"
+    model = make_model(policy=policy, env_kwargs={"target": target}, policy_kwargs=dict(memory=memory)).learn(256)
+    obs = model.get_env().reset()
+    hidden = {key: value for key, value in obs.items() if key != "privileged"}
+    wrong = {**obs, "privileged": np.full_like(obs["privileged"], 9.0)}
+    actions = [model.predict(o, deterministic=True)[0] for o in (obs, hidden, wrong)]
+    np.testing.assert_array_equal(actions[0], actions[1])
+    np.testing.assert_array_equal(actions[0], actions[2])
+
+
+@pytest.mark.parametrize("memory", ["gru", "transformer"])
+def test_predict_carries_its_memory_and_forgets_at_episode_starts(memory):
+    model = make_model(policy_kwargs=dict(memory=memory)).learn(256)
+    venv = make_venv(3)
+    obs, state, states = venv.reset(), None, []
+    for _ in range(5):
+        action, state = model.predict(obs, state, deterministic=True)
+        states.append(state)
+        obs, *_ = venv.step(action)
+    fresh_action, fresh = model.predict(obs, deterministic=True)
+    reset_action, reset = model.predict(obs, state, episode_start=np.ones(3, bool), deterministic=True)
+    np.testing.assert_allclose(fresh_action, reset_action, atol=1e-6)
+    np.testing.assert_allclose(fresh.uncertainty, reset.uncertainty, atol=1e-6)
+    # predict is a function of its arguments: an old state still gives what it gave.
+    again = model.predict(obs, states[-1], deterministic=True)
+    np.testing.assert_array_equal(model.predict(obs, state, deterministic=True)[0], again[0])
+    # One environment alone equals the same one among others.
+    single = {key: value[1] for key, value in obs.items()}
+    state_1 = tuple(part[1:2] if isinstance(part, np.ndarray) else tuple(p[1:2] for p in part) for part in state)
+    alone, _ = model.predict(single, state_1, deterministic=True)
+    np.testing.assert_allclose(alone, again[0][1], atol=1e-5)
+    assert alone.shape == (1,)
+
+
+def test_deployment_sees_the_uncertainty_that_training_showed():
+    """The belief and smoothed uncertainty of ``predict`` equal those of the rollout wrapper for the same history."""
+    model = make_model(mismatch_fraction=0.0, blur=False).learn(256)
+    wrapper = model._rollout_env
+    obs = wrapper.begin(model.env.reset())
+    state, starts = None, np.ones(8, dtype=bool)
+    for _ in range(20):
+        _, state = model.predict({"common": obs["common"]}, state, starts, deterministic=True)
+        np.testing.assert_allclose(state.uncertainty, obs["uncertainty"], atol=1e-5)
+        np.testing.assert_allclose(state.belief_mean, obs["belief"], atol=1e-5)
+        obs, _, starts, _ = wrapper.step(np.clip(state.previous_action, -1, 1))
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (np.zeros(2), "expected a dict"),
+        (({"common": np.zeros(2)}, {}), "pass only obs"),
+        ({"privileged": np.zeros(1)}, r"also needs \['common'\]"),
+        ({"common": np.array([np.nan, 0.0], np.float32)}, "holds nan"),
+    ],
+)
+def test_bad_observations_are_explained(observation, message):
+    with pytest.raises(ValueError, match=message):
+        make_model().predict(observation)
+
+
+def test_a_state_of_other_environments_is_refused():
+    model = make_model()
+    _, state = model.predict({"common": np.zeros((3, 2), np.float32)})
+    with pytest.raises(ValueError, match="holds 3 environments but 2"):
+        model.predict({"common": np.zeros((2, 2), np.float32)}, state)
+
+
+# -- saving ------------------------------------------------------------------------------------------------------------------
+
+
+def test_save_and_load_restore_everything(tmp_path):
+    model = make_model(policy_kwargs=dict(memory="transformer"), warmup_timesteps=0, ramp_timesteps=256).learn(
+        200
+    )  # mid-episode
+    model.save(tmp_path / "model")
+    loaded = USPLPPO.load(tmp_path / "model", env=make_venv())
+    assert_equal_parameters(parameters(model), parameters(loaded))
+    for name in ("optimizer", "encoder_optimizer"):
+        theirs, mine = getattr(model.policy, name).state_dict(), getattr(loaded.policy, name).state_dict()
+        assert theirs["state"].keys() == mine["state"].keys() and len(mine["state"])
+        for key in mine["state"]:
+            th.testing.assert_close(theirs["state"][key], mine["state"][key])
+    assert loaded.progress == model.progress > 0
+    obs = model.get_env().reset()
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+    loaded.learn(256, reset_num_timesteps=False)
+    assert loaded.num_timesteps > model.num_timesteps
+
+
+def test_load_with_another_number_of_environments_goes_on(tmp_path):
+    make_model().learn(256).save(tmp_path / "model")
+    loaded = USPLPPO.load(tmp_path / "model", env=make_venv(12))
+    assert loaded.n_mismatched == 3
+    loaded.learn(512)
+
+
+def test_policy_alone_can_be_saved(tmp_path):
+    model = make_model(policy_kwargs=dict(memory="transformer", net_arch=[16], encoder_kwargs=dict(embedding=(24,)))).learn(
+        256
+    )
+    model.policy.save(tmp_path / "policy")
+    policy = MlpPolicy.load(tmp_path / "policy")
+    obs = model.get_env().reset()
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], policy.predict(obs, deterministic=True)[0])
+
+
+def test_set_parameters_restores_a_model():
+    model, other = make_model().learn(256), make_model(seed=5)
+    other.set_parameters(model.get_parameters())
+    assert_equal_parameters(parameters(model), parameters(other))
+
+
+# -- with the rest of SB3 ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.filterwarnings("error")
+def test_callbacks_and_vecnormalize(tmp_path, normalize):
+    venv, eval_env = make_venv(8), make_venv(3, seed=100)
+    if normalize:
+        venv = VecNormalize(venv, norm_obs_keys=["common"])
+        eval_env = VecNormalize(eval_env, norm_obs_keys=["common"], training=False, norm_reward=False)
+    model = USPLPPO("MlpPolicy", venv, **FAST)
+    callbacks = [
+        EvalCallback(eval_env, n_eval_episodes=6, eval_freq=16, best_model_save_path=tmp_path, log_path=tmp_path, verbose=0),
+        CheckpointCallback(16, str(tmp_path)),
+    ]
+    model.learn(512, callback=callbacks)
+    assert "successes" in np.load(tmp_path / "evaluations.npz")
+    best = USPLPPO.load(tmp_path / "best_model", env=venv)
+    best.learn(256)
+    evaluate_policy(model, eval_env, n_eval_episodes=4)
+
+
+def test_subprocesses_and_discrete_actions_and_logs(tmp_path):
+    venv = make_vec_env(
+        ToyEnv,
+        4,
+        env_kwargs=dict(action_space=spaces.MultiDiscrete([2, 3])),
+        vec_env_cls=SubprocVecEnv,
+        vec_env_kwargs=dict(start_method="fork"),
+    )
+    model = USPLPPO("MultiInputPolicy", venv, tensorboard_log=str(tmp_path), mismatch_fraction=0.5, **FAST)
+    model.learn(256)
+    names = {
+        "encoder/nll",
+        "encoder/error",
+        "encoder/std",
+        "encoder/learning_rate",
+        "encoder/replay_fill",
+        "uspl/progress",
+        "uspl/uncertainty",
+        "uspl/prediction_error",
+        "uspl/reward_scale",
+        "uspl/blur",
+    }
+    written = b"".join(path.read_bytes() for path in tmp_path.rglob("events*"))
+    assert all(name.encode() in written for name in names)
+    venv.close()
+
+
+def test_set_env_and_learning_on(tmp_path):
+    model = make_model().learn(256)
+    model.learn(256, reset_num_timesteps=False)
+    assert model.num_timesteps == 512
+    model.set_env(make_venv(8, seed=9))
+    model.learn(256, reset_num_timesteps=False)
+    model.set_env(model.get_env())
+    model.learn(256)
+    assert isinstance(model.get_env(), DummyVecEnv)  # never the uncertainty wrapper
+
+
+def test_training_goes_on_after_a_callback_stopped_it():
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.n_calls < 21
+
+    model = make_model()
+    model.learn(10_000, callback=Stop())
+    model.learn(512, reset_num_timesteps=False)
+
+
+def test_success_of_the_privileged_policy_leaves_out_mismatched_environments():
+    model = make_model(mismatch_fraction=0.25)
+    model._setup_learn(100)
+    infos = [{"is_success": i < 6} for i in range(8)]
+    model._update_info_buffer(infos, np.ones(8, dtype=bool))
+    assert list(model.ep_success_buffer) == [True] * 6
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        (dict(env_kwargs={"bounded": False}), "blur_noise='gaussian'"),
+        (dict(n_envs=2, mismatch_fraction=0.25), "n_envs >= 6"),
+        (dict(discrete_privileged={1: [0.0, 0.25]}), "names dimension 1"),
+        (dict(discrete_privileged={0: [0.0, 3.0]}), "within the bounds"),
+        (dict(discrete_privileged={0: [0.1]}), "two different values"),
+        (dict(blur_noise="pink"), "choose 'uniform' or 'gaussian'"),
+        (dict(replay="none"), "'mismatched' or 'all'"),
+        (dict(decision_period=0.0), "decision_period=0.0 is outside"),
+        (dict(mismatch_fraction=1.5), "mismatch_fraction=1.5 is outside"),
+        (dict(smoothing_time=-1.0), "smoothing_time=-1.0 is outside"),
+        (dict(use_sde=True), "use_sde"),
+        (dict(policy="CnnPolicy"), "needs a uint8 image"),
+        (dict(policy_kwargs=dict(memory="lstm")), "the memories"),
+    ],
+)
+def test_bad_arguments_are_explained_at_construction(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_model(**kwargs)
+
+
+def test_a_box_environment_is_sent_to_the_wrapper():
+    with pytest.raises(ValueError, match="PrivilegedObservation"):
+        USPLPPO("MlpPolicy", "Pendulum-v1")
+
+
+def test_an_episode_beyond_the_context_is_explained():
+    with pytest.raises(ValueError, match="context of 5 decisions"):
+        make_model(context_length=5).learn(256)
+
+
+def test_one_environment_works_with_a_warning():
+    with pytest.warns(UserWarning, match="mismatch_fraction=0"):
+        model = make_model(n_envs=1)
+    assert model.n_mismatched == 0
+    model.learn(64)
+
+
+def test_decision_period_comes_from_the_environment():
+    assert make_model().decision_period == ToyEnv.decision_period
+    assert make_model(decision_period=0.1).decision_period == 0.1
