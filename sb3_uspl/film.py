@@ -26,14 +26,14 @@ FRAMES_PER_SECOND = 8.0
 """Decisions a second in the film; twice real time for decisions of 0.25 s."""
 FIRST_FRAME_TIME, LAST_FRAME_TIME = 1.0, 2.5
 """s for which the beginning and the end of an episode stand still."""
-GIF_COLOURS = 96
+GIF_COLOURS = 200
 _WIDTH, _DPI = 10.0, 90
 _ROW_HEIGHT = {True: 4.1, False: 3.7}  # inches an agent, by whether the panels lie one above the other
 _WIDE = 2.0  # ratio of width to height from which the picture lies above the map instead of beside it
 _PARKED_HEIGHT = -50.0  # m; shapes below are out of use in this episode
 _MARGIN = 0.5  # m around the scene
 _OPEN_FIELD = ((-1.0, -1.0), (1.0, 1.0))  # the map of an environment without a scene, in its own unit
-_LEAST_THICKNESS, _ROBOT_LENGTH = 0.025, 0.045  # share of the map's width
+_LEAST_THICKNESS, _ROBOT_LENGTH = 0.035, 0.045  # share of the map's width
 _GROUND, _REACHED, _FAILED, _ERROR_COLOUR = "#3b4452", "#1b7f3b", "#b3261e", "#333333"
 
 

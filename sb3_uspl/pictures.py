@@ -58,7 +58,8 @@ def learning_curve(progress: Path | Sequence[Path] | Mapping[str, Path | Sequenc
     axes[0, 0].set_ylabel("success (%)")
     axes[1, 0].set_ylabel(r"mean $\sigma$ (privileged units), $\ell$ (-)")
     for row, corner in zip(axes, ("lower right", "center right"), strict=True):
-        row[0].legend(loc=corner, fontsize="small", framealpha=0.95)
+        if row[0].get_legend_handles_labels()[0]:
+            row[0].legend(loc=corner, fontsize="small", framealpha=0.95)
     figure.savefig(out_png)
 
 
