@@ -129,9 +129,7 @@ class PrivilegedObservation(gym.ObservationWrapper):
         elif isinstance(space, spaces.Dict) and all(isinstance(part, spaces.Box) for part in space.values()):
             available = list(space.spaces)
         else:
-            raise ValueError(
-                f"PrivilegedObservation takes a one-dimensional Box or a flat Dict of boxes, not {space}."
-            )
+            raise ValueError(f"PrivilegedObservation takes a one-dimensional Box or a flat Dict of boxes, not {space}.")
         named = [*privileged, *target]
         unknown = [name for name in named if name not in available]
         if unknown or len(set(named)) != len(named) or not privileged:

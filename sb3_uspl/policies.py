@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -111,6 +112,9 @@ class USPLPolicy(ActorCriticPolicy):
     :param privileged_gain: factor that brings privileged values to unit scale
     :param normalize_common: whether actor and critic see the common observation with zero mean and unit variance: a corridor's
         width in units of the whole arena would otherwise take PPO long to notice
+    :param bounded_mean: whether the mean of continuous actions is squashed into the action space by a tanh, as in the authors'
+        release. Without it the mean drifts beyond the bounds, where sampling changes nothing any more and a habit of the
+        warm-up cannot be unlearned.
     :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
     :param kwargs: further arguments of ``ActorCriticPolicy``
     :raises ValueError: for a space outside the contract or an unknown preset
@@ -133,6 +137,7 @@ class USPLPolicy(ActorCriticPolicy):
         mean_input: bool = True,
         privileged_gain: float = 4.0,
         normalize_common: bool = True,
+        bounded_mean: bool = True,
         smoothing: float = 0.0,
         **kwargs: Any,
     ):
@@ -143,6 +148,7 @@ class USPLPolicy(ActorCriticPolicy):
             encoder_kwargs=encoder_kwargs,
             encoder_learning_rate=encoder_learning_rate,
             encoder_weight_decay=encoder_weight_decay,
+            bounded_mean=bounded_mean,
             smoothing=smoothing,
         )
         self.feature_arguments: dict[str, Any] = dict(
@@ -165,6 +171,13 @@ class USPLPolicy(ActorCriticPolicy):
             share_features_extractor=False,
             **kwargs,
         )
+        self.bounded_mean = bounded_mean and isinstance(action_space, spaces.Box)
+        if self.bounded_mean:
+            low, high = (th.as_tensor(bound, device=self.device) for bound in (action_space.low, action_space.high))  # type: ignore[attr-defined]
+            self.action_centre: th.Tensor
+            self.action_half_range: th.Tensor
+            self.register_buffer("action_centre", 0.5 * (high + low).flatten())
+            self.register_buffer("action_half_range", 0.5 * (high - low).flatten())
         # Built after super().__init__, whose optimizer must not hold the encoder.
         self.smoothing = smoothing
         n_action = get_flattened_obs_dim(action_space)
@@ -184,6 +197,13 @@ class USPLPolicy(ActorCriticPolicy):
         data.pop("features_extractor_class")
         data.pop("features_extractor_kwargs")
         return {**data, "observation_space": self.contract, **self.encoder_arguments, **self.feature_arguments}
+
+    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
+        if not self.bounded_mean:
+            return super()._get_action_dist_from_latent(latent_pi)
+        assert isinstance(self.action_dist, DiagGaussianDistribution)
+        mean = self.action_centre + self.action_half_range * th.tanh(self.action_net(latent_pi))
+        return self.action_dist.proba_distribution(mean, self.log_std)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         return super().forward(self._only_policy_keys(obs), deterministic)  # type: ignore[arg-type]

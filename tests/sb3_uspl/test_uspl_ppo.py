@@ -55,7 +55,9 @@ def test_with_everything_off_it_is_stock_ppo(action_space):
         uncertainty_input=False,
         mismatch_fraction=0.0,
         encoder_batch_size=64,
-        policy_kwargs=dict(net_arch=[32], activation_fn=th.nn.Tanh, privileged_gain=1.0, normalize_common=False),
+        policy_kwargs=dict(
+            net_arch=[32], activation_fn=th.nn.Tanh, privileged_gain=1.0, normalize_common=False, bounded_mean=False
+        ),
         **common,
     )
     ours.learn(4 * 16 * 4)
@@ -368,3 +370,14 @@ def test_one_environment_works_with_a_warning():
 def test_decision_period_comes_from_the_environment():
     assert make_model().decision_period == ToyEnv.decision_period
     assert make_model(decision_period=0.1).decision_period == 0.1
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.0, 10.0)])
+def test_mean_actions_stay_where_sampling_still_matters(low, high):
+    model = make_model(env_kwargs=dict(action_space=spaces.Box(low, high, (2,), np.float32)))
+    for bias, expected in ((50.0, high), (-50.0, low), (0.0, 0.5 * (low + high))):
+        with th.no_grad():
+            model.policy.action_net.weight.zero_()
+            model.policy.action_net.bias.fill_(bias)
+        actions, _ = model.predict({"common": np.zeros((4, 2), np.float32)}, deterministic=True)
+        np.testing.assert_allclose(actions, expected, atol=1e-5)
