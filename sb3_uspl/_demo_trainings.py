@@ -17,7 +17,7 @@ import yaml
 from sb3_uspl._zoo import CONFIGS
 
 NAMES = {"uspl_ppo": "USPL", "rma": "RMA"}
-EVAL_FREQ, EVAL_EPISODES, N_EVAL_ENVS = 50_000, 100, 50
+EVAL_FREQ, EVAL_EPISODES, N_EVAL_ENVS = 50_000, 100, 25
 """Evaluations during training: every so many decisions, on so many episodes, in so many environments."""
 REPORT_PERIOD, POLL_PERIOD = 10.0, 0.5
 """s between two progress lines, and between two looks at the children."""
