@@ -1,8 +1,10 @@
 """``python -m sb3_uspl.evaluate``: success of a trained agent over fresh episodes, all of them counted."""
 
 import argparse
+import contextlib
 import json
 import os
+import sys
 from typing import Any
 
 import torch as th
@@ -33,11 +35,15 @@ def load_agent(
     :param n_envs: number of environments
     :param env_kwargs: passed to the environment
     :return: model and environments, normalised as in training
+    :raises ValueError: if there is no such agent, or the environment refuses its arguments
     """
     from rl_zoo3.utils import create_test_env, get_model_path, get_saved_hyperparams
 
     name = rl_zoo3.utils.EnvironmentName(env_id)
-    _, model_path, log_path = get_model_path(exp_id, folder, algo, name, load_best=best)
+    try:
+        _, model_path, log_path = get_model_path(exp_id, folder, algo, name, load_best=best)
+    except (AssertionError, ValueError) as error:
+        raise ValueError(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error
     hyperparams, stats_path = get_saved_hyperparams(os.path.join(log_path, env_id), test_mode=True)
     venv = create_test_env(
         env_id,
@@ -76,25 +82,31 @@ def main() -> None:
         raise SystemExit(f"--episodes {arguments.episodes}: at least one episode is needed.")
     register()
     th.set_num_threads(1)
-    env_kwargs = {"physics": arguments.physics} if arguments.physics else None
-    try:
-        model, venv = load_agent(
-            arguments.algo,
-            arguments.env,
-            arguments.folder,
-            arguments.exp_id,
-            arguments.load_best,
-            arguments.n_envs,
-            env_kwargs,
-        )
-    except (AssertionError, ValueError) as error:
-        raise SystemExit(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error
-    result = {"algo": arguments.algo, "env": arguments.env, "physics": arguments.physics}
-    result |= evaluate(model, venv, arguments.episodes, arguments.seed, arguments.policy)
-    venv.close()
+    with contextlib.redirect_stdout(sys.stderr):  # the zoo prints too
+        result = _measure(arguments)
     if arguments.json:
         print(json.dumps(result))
-        return
+    else:
+        _print_table(result)
+
+
+def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
+    env_kwargs = {"physics": arguments.physics} if arguments.physics else None
+    n_envs = min(arguments.n_envs, arguments.episodes)
+    try:
+        model, venv = load_agent(
+            arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs, env_kwargs
+        )
+    except ValueError as error:
+        raise SystemExit(str(error)) from error
+    try:
+        result = evaluate(model, venv, arguments.episodes, arguments.seed, arguments.policy)
+    finally:
+        venv.close()
+    return {"algo": arguments.algo, "env": arguments.env, "physics": arguments.physics, **result}
+
+
+def _print_table(result: dict[str, Any]) -> None:
     for name in ("deployment", "privileged"):
         prefix = "" if name == "deployment" else "privileged_"
         if result[f"{prefix}success_rate"] is not None:
