@@ -51,7 +51,8 @@ class USPLPPO(PPO):
     :param normalize_advantage: of PPO
     :param ent_coef: of PPO (the release's has no effect)
     :param vf_coef: of PPO
-    :param max_grad_norm: of PPO, for actor and critic
+    :param max_grad_norm: of PPO, for actor and critic together. The release clips at 40; at SB3's 0.5 the critic, whose returns
+        Eq. 2 scales by up to 3, leaves the actor hardly any gradient.
     :param use_sde: must be False
     :param sde_sample_freq: unused
     :param rollout_buffer_class: a subclass of ``USPLRolloutBuffer``
@@ -123,7 +124,7 @@ class USPLPPO(PPO):
         normalize_advantage: bool = True,
         ent_coef: float = 0.0,
         vf_coef: float = 0.5,
-        max_grad_norm: float = 0.5,
+        max_grad_norm: float = 40.0,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         rollout_buffer_class: type[RolloutBuffer] | None = USPLRolloutBuffer,

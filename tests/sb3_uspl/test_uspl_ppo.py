@@ -41,7 +41,7 @@ def assert_equal_parameters(a, b, only=""):
 @pytest.mark.parametrize("action_space", [spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(3)], ids=["box", "discrete"])
 def test_with_everything_off_it_is_stock_ppo(action_space):
     """Same seed, same networks, same samples, same updates: the actor's and critic's weights are identical."""
-    common = dict(n_steps=16, batch_size=32, n_epochs=2, seed=3, gamma=0.9)
+    common = dict(n_steps=16, batch_size=32, n_epochs=2, seed=3, gamma=0.9, max_grad_norm=0.5)
     kwargs = dict(action_space=action_space, terminate=False)  # time-outs: bootstrapping has to agree too
     stock = PPO("MultiInputPolicy", make_venv(4, 3, **kwargs), policy_kwargs=dict(net_arch=[32]), **common)
     stock.learn(4 * 16 * 4)  # before the other model is built, as both draw from the same generator
