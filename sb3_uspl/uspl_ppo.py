@@ -51,8 +51,8 @@ class USPLPPO(PPO):
     :param normalize_advantage: of PPO
     :param ent_coef: of PPO (the release's has no effect)
     :param vf_coef: of PPO
-    :param max_grad_norm: of PPO, for actor and critic together. The release clips at 40; at SB3's 0.5 the critic, whose returns
-        Eq. 2 scales by up to 3, leaves the actor hardly any gradient.
+    :param max_grad_norm: of PPO, for actor and critic together (release: 40). At SB3's 0.5 the critic, whose returns Eq. 2
+        scales by up to 3, leaves the actor hardly any gradient.
     :param use_sde: must be False
     :param sde_sample_freq: unused
     :param rollout_buffer_class: a subclass of ``USPLRolloutBuffer``
