@@ -103,9 +103,7 @@ def _shade_schedule(axis: Axes, run: pd.DataFrame, label: bool) -> None:
         if right > left:
             axis.axvspan(left, right, color=colour, zorder=0, linewidth=0)
             if label:
-                axis.text(
-                    (left + right) / 2, 1.0, text, transform=axis.get_xaxis_transform(), ha="center", va="top", alpha=0.7
-                )
+                axis.text(left, 1.0, f" {text}", transform=axis.get_xaxis_transform(), va="top", alpha=0.7)
 
 
 def on_map(

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import cv2
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
@@ -26,7 +27,7 @@ class TargetReachingEnv(gym.Env):
     **Source.** Fig. 1; sizes are ours, the paper gives none.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's convention)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (gymnasium's convention)
 
     decision_period = 0.2
     """s"""
@@ -38,7 +39,13 @@ class TargetReachingEnv(gym.Env):
     PROGRESS_WEIGHT = 5.0
     SUCCESS_BONUS = 2.0
 
-    def __init__(self) -> None:
+    PICTURE_SIZE = 240
+    """pixels"""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"Unknown render_mode {render_mode!r}; known: None, 'rgb_array'.")
+        self.render_mode = render_mode
         limit = 0.25 * self.TARGET_X
         self.observation_space = spaces.Dict(
             {
@@ -62,6 +69,21 @@ class TargetReachingEnv(gym.Env):
         success = bool(after < self.RADIUS)
         reward = self.PROGRESS_WEIGHT * (before - after) + self.SUCCESS_BONUS * success
         return self._observe(), float(reward), success, False, {"is_success": success, "position": self.position.copy()}
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        The room from above: target green, point orange.
+
+        :return: uint8 ``(240, 240, 3)``; None without ``render_mode="rgb_array"``
+        """
+        if self.render_mode is None:
+            return None
+        picture = np.full((self.PICTURE_SIZE, self.PICTURE_SIZE, 3), 235, dtype=np.uint8)
+        radius = int(0.5 * self.RADIUS * self.PICTURE_SIZE)
+        for place, size, colour in ((self.target, radius, (51, 184, 97)), (self.position, radius // 3, (214, 94, 0))):
+            x, y = (0.5 * (1.0 + place * np.array([1.0, -1.0])) * self.PICTURE_SIZE).astype(int).tolist()
+            cv2.circle(picture, (x, y), size, colour, thickness=-1, lineType=cv2.LINE_AA)
+        return picture
 
     def belief_in_world(self, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
