@@ -50,7 +50,9 @@ def evaluate_all(
     trainings: Trainings, episodes: int
 ) -> tuple[dict[str, dict[str, Any]], dict[str, list[EpisodeRecord]], dict[str, BaseAlgorithm]]:
     """
-    Evaluate the last model of every training, both of its policies, on the same episodes.
+    Evaluate the best model of every training, both of its policies, on the same episodes.
+
+    Best in the evaluations during the training, whose episodes have other seeds than those here.
 
     :param trainings: finished
     :param episodes: of each policy
@@ -64,7 +66,7 @@ def evaluate_all(
         assert training is not None
         folder = str(trainings.folder / "logs")
         n_envs = min(N_ENVS, episodes)
-        models[name], venv = load_agent(algo, trainings.env_id, folder, training.exp_id, n_envs=n_envs)
+        models[name], venv = load_agent(algo, trainings.env_id, folder, training.exp_id, True, n_envs)
         try:
             records[name] = run_episodes(models[name], venv, episodes)
             privileged = run_episodes(models[name], venv, episodes, policy="privileged")
@@ -105,7 +107,7 @@ def main() -> None:
     folder: Path = arguments.folder
     trainings = Trainings(folder, arguments.env, arguments.seed, arguments.timesteps)
     trainings.run_all(arguments.one_by_one)
-    print(f"Evaluating the last models, {arguments.episodes} episodes of each policy ...", flush=True)
+    print(f"Evaluating the models that were best in training, {arguments.episodes} episodes of each policy ...", flush=True)
     results, records, models = evaluate_all(trainings, arguments.episodes)
 
     print(f"\n{'':6}{'deployment policy':>18}{'95 % interval':>18}{'privileged policy':>20}{'episode':>10}{'training':>11}")
