@@ -66,7 +66,9 @@ def evaluate_all(
         assert training is not None
         folder = str(trainings.folder / "logs")
         n_envs = min(N_ENVS, episodes)
-        models[name], venv = load_agent(algo, trainings.env_id, folder, training.exp_id, True, n_envs)
+        # A training shorter than the time to its first evaluation has a last model only.
+        best = (trainings.path(algo, training) / "best_model.zip").is_file()
+        models[name], venv = load_agent(algo, trainings.env_id, folder, training.exp_id, best, n_envs)
         try:
             records[name] = run_episodes(models[name], venv, episodes)
             privileged = run_episodes(models[name], venv, episodes, policy="privileged")
