@@ -8,13 +8,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 from torch import nn
 
-from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, reset_rows
+from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, encode_actions, reset_rows
 from sb3_uspl.observations import (
     BELIEF,
     COMMON,
@@ -83,7 +83,7 @@ class PolicyFeatures(BaseFeaturesExtractor):
             # Log scale, as the reward transformation: MIN_STD -> -1, INITIAL_STD -> 1.
             middle = 0.5 * (math.log(INITIAL_STD) + math.log(MIN_STD))
             half = 0.5 * (math.log(INITIAL_STD) - math.log(MIN_STD))
-            parts.append((th.log(obs[UNCERTAINTY]) - middle) / half)
+            parts.append((th.log(obs[UNCERTAINTY].clamp(min=MIN_STD)) - middle) / half)
         if self.mean_input:
             parts.append(obs[BELIEF] * self.privileged_gain)
         return th.cat(parts, dim=1)
@@ -299,10 +299,8 @@ class USPLPolicy(ActorCriticPolicy):
         actions = actions.reshape((n_envs, *self.action_space.shape))  # type: ignore[misc, arg-type]
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
-        encoded = preprocess_obs(th.as_tensor(actions), self.action_space, normalize_images=False)
-        assert isinstance(encoded, th.Tensor)
         next_state = DeploymentState(
-            mean, std, encoded.reshape(n_envs, -1).numpy().copy(), tuple(part.cpu().numpy() for part in memory)
+            mean, std, encode_actions(actions, self.action_space), tuple(part.cpu().numpy() for part in memory)
         )
         return (actions if vectorized else actions[0]), next_state
 

@@ -418,6 +418,7 @@ class USPLPPO(PPO):
         self.logger.record("uspl/progress", wrapper.progress)
         if self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0):
             self._train_encoder(episodes)
+            self.policy.encoder.eval()
             tokens, lengths = episodes.running_tokens(self.device)
             wrapper.rebuild_memory(tokens, lengths)
         episodes.end_iteration()
@@ -450,7 +451,6 @@ class USPLPPO(PPO):
             stds.append(belief.std[mask].mean().item())
         # PPO clips the gradients of the whole policy; the encoder's must not be among them.
         optimizer.zero_grad(set_to_none=True)
-        encoder.eval()
         self.logger.record("encoder/nll", float(np.mean(losses)))
         self.logger.record("encoder/error", float(np.mean(errors)))
         self.logger.record("encoder/std", float(np.mean(stds)))

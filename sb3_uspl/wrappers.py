@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_uspl.encoder import ObservationEncoder, reset_rows, take_rows
+from sb3_uspl.encoder import ObservationEncoder, encode_actions, reset_rows, take_rows
 from sb3_uspl.observations import (
     BELIEF,
     COMMON,
@@ -123,8 +123,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
             obs = {PRIVILEGED: obs[TRUTH], **{key: obs[key] for key in (COMMON, TARGET) if key in obs}}
         self.memory = self.encoder.memory.initial_state(self.num_envs)
         self.std = np.full(self._shape, INITIAL_STD, dtype=np.float32)
-        self.previous_action = self._encode_action(np.zeros((self.num_envs, *self.action_space.shape)))  # type: ignore[misc]
-        self.previous_action[:] = 0.0
+        self.previous_action = np.zeros((self.num_envs, get_flattened_obs_dim(self.action_space)), dtype=np.float32)
         self.step_count = np.zeros(self.num_envs, dtype=np.int64)
         self.redraw_mismatch()
         return self._observe(obs)
@@ -136,7 +135,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self._source[order] = np.roll(order, 1)
 
     def step_async(self, actions: np.ndarray) -> None:
-        self.previous_action = self._encode_action(actions)
+        self.previous_action = encode_actions(actions, self.action_space)
         self.venv.step_async(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -218,11 +217,6 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     @staticmethod
     def _assemble(obs: dict[str, np.ndarray], shown: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, np.ndarray]:
         return {COMMON: obs[COMMON], PRIVILEGED: shown, TRUTH: obs[PRIVILEGED], UNCERTAINTY: std, BELIEF: mean}
-
-    def _encode_action(self, actions: np.ndarray) -> np.ndarray:
-        encoded = preprocess_obs(th.as_tensor(actions), self.action_space, normalize_images=False)
-        assert isinstance(encoded, th.Tensor)
-        return encoded.reshape(self.num_envs, -1).numpy().copy()
 
     def _as_tokens(self, obs: dict[str, np.ndarray], previous_action: np.ndarray) -> dict[str, th.Tensor]:
         tokens = {key: th.as_tensor(obs[key], device=self.device) for key in (COMMON, TARGET) if key in obs}

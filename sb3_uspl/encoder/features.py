@@ -2,15 +2,29 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
 
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, TARGET
 
 Tokens = dict[str, th.Tensor]
 """Encoder inputs by key (``common``, ``target``, ``previous_action``), each ``(..., *shape of the key)``."""
+
+
+def encode_actions(actions: np.ndarray, space: spaces.Space) -> np.ndarray:
+    """
+    Actions as the encoder sees them: continuous ones as they are, discrete ones one-hot.
+
+    :param actions: ``(n_envs, *shape)``, as passed to the environments
+    :param space: action space
+    :return: new array ``(n_envs, n_action)``, float32
+    """
+    encoded = preprocess_obs(th.as_tensor(actions), space, normalize_images=False)
+    assert isinstance(encoded, th.Tensor)
+    return encoded.reshape(len(actions), -1).numpy().copy()
 
 
 def mlp(n_inputs: int, hidden: Sequence[int]) -> nn.Sequential:

@@ -381,3 +381,10 @@ def test_mean_actions_stay_where_sampling_still_matters(low, high):
             model.policy.action_net.bias.fill_(bias)
         actions, _ = model.predict({"common": np.zeros((4, 2), np.float32)}, deterministic=True)
         np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+def test_a_chosen_uncertainty_of_zero_is_certainty_not_nan():
+    model, obs = make_model(), {"common": np.ones((4, 2), np.float32)}
+    certain, least = (model.policy.act(obs, deterministic=True, uncertainty=u)[0] for u in (0.0, 0.005))
+    np.testing.assert_array_equal(certain, least)
+    assert np.isfinite(certain).all()
