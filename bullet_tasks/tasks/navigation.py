@@ -44,7 +44,8 @@ class NavigationTask(Task):
     """
     Walk at constant speed to a goal on a platform, steering by heading.
 
-    A subclass sets ``scene`` and draws ``goal`` in ``reset``.
+    A subclass sets ``scene`` and draws ``goal`` in ``reset``, and ``dead_zones`` where the task has any: the middles of
+    circles as wide as the goal's, in which an episode ends as a failure.
 
     :param decision_period: s
     :param time_limit: s
@@ -64,6 +65,7 @@ class NavigationTask(Task):
         self.goal_radius = goal_radius
         self.reward = reward
         self.goal = (0.0, 0.0)
+        self.dead_zones: tuple[tuple[float, float], ...] = ()
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.common_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._distance = 0.0
@@ -97,13 +99,16 @@ class NavigationTask(Task):
 
     def outcome(self, state: RobotState) -> Outcome:
         """
-        Success in the goal circle, failure over a drop (see base class).
+        Success in the goal circle, failure in a dead zone or over a drop (see base class).
 
         :param state: of the robot
         """
         x, y = state.x, state.y
         if math.hypot(self.goal[0] - x, self.goal[1] - y) <= self.goal_radius:
             return Outcome.SUCCESS
+        for zone_x, zone_y in self.dead_zones:
+            if math.hypot(zone_x - x, zone_y - y) <= self.goal_radius:
+                return Outcome.FAILURE
         # Floors stay where they are, so the scene of any episode will do.
         if self.scene.ground_height(x, y) < FALL_HEIGHT:
             return Outcome.FAILURE
