@@ -1,5 +1,6 @@
 """Sensors: what a robot can perceive of the scene; their readings are the ``target`` observation."""
 
 from bullet_tasks.sensors.base import Sensor
+from bullet_tasks.sensors.scandots import Scandots
 
-__all__ = ["Sensor"]
+__all__ = ["Scandots", "Sensor"]
