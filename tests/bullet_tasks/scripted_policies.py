@@ -1,7 +1,7 @@
 """Hand-written policies that show what a task allows, and a loop that runs them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import gymnasium
@@ -13,6 +13,7 @@ Policy = Callable[[dict[str, np.ndarray]], np.ndarray]
 
 POSITION_SCALE = 8.0  # m, of the pose in `common`
 LOOK_AHEAD = 1.0  # m
+NEAR = 0.35  # m; a waypoint this near is passed, as is the turning radius
 GOAL_BEHIND = 3.56  # m; walking on the middle line, a robot this far out has passed the rim of any goal circle
 
 
@@ -77,6 +78,89 @@ class Blind:
         if self.direction * x > GOAL_BEHIND:
             self.direction = -self.direction
         return walk(observation, self.direction)
+
+
+def position(observation: dict[str, np.ndarray]) -> tuple[float, float]:
+    """
+    Where the robot is, m.
+
+    :param observation: ``common`` is read, nothing else
+    """
+    return float(observation["common"][0]) * POSITION_SCALE, float(observation["common"][1]) * POSITION_SCALE
+
+
+def towards(observation: dict[str, np.ndarray], point: tuple[float, float]) -> np.ndarray:
+    """
+    Walk straight to a point.
+
+    :param observation: ``common`` is read, nothing else
+    :param point: m
+    """
+    x, y = position(observation)
+    heading = math.atan2(point[1] - y, point[0] - x)
+    turn = math.remainder(heading - math.atan2(float(observation["common"][3]), float(observation["common"][2])), math.tau)
+    return np.array([max(-1.0, min(1.0, turn / MAX_TURN))], dtype=np.float32)
+
+
+class Route:
+    """
+    Walk from point to point.
+
+    :param points: m; the last one is walked to for ever
+    """
+
+    def __init__(self, points: Sequence[tuple[float, float]] = ()) -> None:
+        self.points = list(points)
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """
+        :param observation: ``common`` is read, nothing else
+        """
+        while len(self.points) > 1 and math.dist(position(observation), self.points[0]) < NEAR:
+            del self.points[0]
+        return towards(observation, self.points[0])
+
+
+def maze_route(sign_x: float, sign_y: float) -> list[tuple[float, float]]:
+    """
+    The roads of Square Maze to a corner, from the trunk or the crossing road.
+
+    :param sign_x: of the corner
+    :param sign_y: of the corner
+    """
+    return [(0.0, 0.0), (sign_x * 2.2, 0.0), (sign_x * 2.4, sign_y * 1.55)]
+
+
+class MazeProbe:
+    """Solve Square Maze blind: walk straight into each junction and feel whether the road goes on."""
+
+    # Where a base that walks straight on is stopped by the curb of a T is 0.43 and 2.67 m from the middle.
+    OPEN_SOUTH, OPEN_SIDE = 0.6, 2.8  # m
+    STOPPED = 0.05  # m; less way than this within a decision, with 0.175 m asked for
+
+    def __init__(self) -> None:
+        self.side: float | None = None
+        self.route: Route | None = None
+        self.last = (math.inf, math.inf)
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """
+        :param observation: ``common`` is read, nothing else
+        """
+        x, y = here = position(observation)
+        stopped = math.dist(here, self.last) < self.STOPPED
+        self.last = here
+        if self.side is None and (stopped or y < -self.OPEN_SOUTH):
+            self.side = -1.0 if stopped else 1.0
+            self.last = (math.inf, math.inf)
+        if self.side is None:
+            return towards(observation, (0.0, y - LOOK_AHEAD))
+        beyond = abs(x) > self.OPEN_SIDE
+        if self.route is None and (beyond or (stopped and abs(x) > self.OPEN_SIDE - 0.2)):
+            self.route = Route(maze_route(self.side, 1.0 if beyond else -1.0)[1:])
+        if self.route is None:
+            return towards(observation, (x + self.side * LOOK_AHEAD, 0.0))
+        return self.route(observation)
 
 
 def run_episode(env: gymnasium.Env, policy: Policy, seed: int | None = None) -> Episode:
