@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import sb3_uspl.envs
 
-ENV_IDS = ["TargetReaching-v0"]
+ENV_IDS = ["TargetReaching-v0", "ActiveTMaze-v0"]
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
