@@ -11,8 +11,9 @@ from gymnasium import spaces
 
 from bullet_tasks.robots.base import Robot
 from bullet_tasks.sensors import Sensor
-from bullet_tasks.simulation import Camera, Simulation
+from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Outcome, Task
+from bullet_tasks.world import World
 
 _VIEWS = ("top", "follow")
 _FOLLOWING_SIZE = (480, 360)  # pixels
@@ -30,7 +31,9 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     An episode depends on its seed and the actions alone, not on what happened before: it is started by repositioning
     bodies, which in PyBullet leaves no trace in later steps for a body without legs.
 
-    :param make_robot: creates the robot in a simulation
+    PyBullet runs only where the robot's physics or a picture needs it.
+
+    :param make_robot: creates the robot in a world
     :param task: geometry, goal, rewards and ends
     :param sensors: at most one; its readings are the ``target`` observation
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
@@ -42,7 +45,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
     def __init__(
         self,
-        make_robot: Callable[[Simulation], Robot[Any]],
+        make_robot: Callable[[World], Robot[Any]],
         task: Task,
         sensors: Sequence[Sensor] = (),
         render_mode: str | None = None,
@@ -67,11 +70,11 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.action_space = task.action_space
         self._action_shape = task.action_space.shape
 
-        self.simulation = Simulation(gui=render_mode == "human")
+        self.world = World(task.scene, gui=render_mode == "human")
         try:
-            self.scene = task.scene
-            self.scene.build(self.simulation)
-            self.robot = make_robot(self.simulation)
+            self.robot = make_robot(self.world)
+            if render_mode is not None:
+                self.robot.appear(self.world.simulation)
             substeps = task.decision_period / self.robot.substep_period
             if round(substeps) < 1 or abs(substeps - round(substeps)) > _PERIOD_TOLERANCE:
                 raise ValueError(
@@ -79,9 +82,9 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
                     f"({self.robot.substep_period} s)."
                 )
         except BaseException:
-            self.simulation.close()
+            self.world.close()
             raise
-        self._substeps = range(round(substeps))
+        self._substeps = round(substeps)
         self._elapsed_substeps = 0
         self._substeps_in_limit = task.time_limit / self.robot.substep_period
 
@@ -100,13 +103,12 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         if options:
             raise ValueError(f"Unknown reset options {sorted(options)}; this environment has none.")
         start = self.task.reset(self.np_random)
-        self.scene = self.task.scene.moved(start.placements)
-        for name, (centre, yaw) in start.placements.items():
-            self.simulation.place(name, centre, yaw)
-        state = self.robot.reset(start.x, start.y, self.scene.ground_height(start.x, start.y), start.yaw)
-        self.task.begin(state)
+        self.world.place(start.placements)
+        scene = self.world.scene
+        state = self.robot.reset(start.x, start.y, scene.ground_height(start.x, start.y), start.yaw)
+        self.task.begin(state, scene)
         for sensor in self.sensors:
-            sensor.reset(self.scene, self.np_random)
+            sensor.reset(scene, self.np_random)
         self._elapsed_substeps = 0
         info = {"is_success": False, "position": np.array((state.x, state.y), dtype=np.float32)}
         return self._observation(), info
@@ -121,15 +123,9 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self._check_open()
         task, robot = self.task, self.robot
         robot.command(task.command(self._checked(action), robot.state))
-        contacts = 0
-        outcome = Outcome.RUNNING
-        for _ in self._substeps:
-            state = robot.substep()
-            self._elapsed_substeps += 1
-            contacts += state.in_contact
-            outcome = task.outcome(state)
-            if outcome is not Outcome.RUNNING:
-                break
+        substeps, contacts, outcome = robot.advance(self._substeps, task.judge)
+        state = robot.state
+        self._elapsed_substeps += substeps
         time_left = max(0.0, 1.0 - self._elapsed_substeps / self._substeps_in_limit)
         terms = task.reward_terms(state, contacts * robot.substep_period, time_left, outcome)
         info = {
@@ -138,12 +134,13 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             "reward_terms": terms,
         }
         if self.render_mode == "human":
+            robot.appear(self.world.simulation)
             time.sleep(self.decision_period)
         return self._observation(), sum(terms.values()), outcome is not Outcome.RUNNING, False, info
 
     def _check_open(self) -> None:
         # PyBullet gives the number of a closed client to the next one: a step now would move somebody else's robot.
-        if self.simulation.closed:
+        if self.world.closed:
             raise RuntimeError("This environment is closed; make a new one.")
 
     def _checked(self, action: np.ndarray) -> list[float]:
@@ -170,11 +167,12 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         if self.render_mode != "rgb_array":
             return None
         self._check_open()
+        simulation, state = self.world.simulation, self.robot.state
+        self.robot.appear(simulation)
         if self.view == "top":
-            return self.simulation.picture(self.task.camera, *self.task.picture_size)
-        state = self.robot.state
-        return self.simulation.picture(Camera.following((state.x, state.y, state.z), state.yaw), *_FOLLOWING_SIZE)
+            return simulation.picture(self.task.camera, *self.task.picture_size)
+        return simulation.picture(Camera.following((state.x, state.y, state.z), state.yaw), *_FOLLOWING_SIZE)
 
     def close(self) -> None:
-        """Close the simulation; a second call does nothing."""
-        self.simulation.close()
+        """Close the world; a second call does nothing."""
+        self.world.close()

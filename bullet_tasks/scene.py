@@ -1,11 +1,14 @@
-"""A scene as data: named shapes that physics, pictures and ray casters all read."""
+"""A scene as data: named shapes that physics, pictures and sensors all read."""
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from bullet_tasks import kernels
 from bullet_tasks.shapes import Box, Colour, Shape, Vector3
 
 if TYPE_CHECKING:
@@ -17,6 +20,22 @@ PARKED: Vector3 = (0.0, 0.0, -100.0)
 _GROUND_COLOUR: Colour = (0.21, 0.25, 0.31, 1.0)
 _GROUND_HALF_SIZE = 20.0  # m, only for the eye
 _GROUND_HALF_THICKNESS = 0.01  # m
+
+
+def _packed_row(shape: Shape) -> tuple[float, ...]:
+    """Columns as in ``kernels``."""
+    x, y, z = shape.centre
+    if isinstance(shape, Box):
+        half_x, half_y, half_z = shape.half_extents
+        cos, sin, is_round = math.cos(shape.yaw), math.sin(shape.yaw), False
+    else:
+        half_x, half_y, half_z = shape.radius, shape.radius, shape.half_height
+        cos, sin, is_round = 1.0, 0.0, True
+    return (x, y, cos, sin, half_x, half_y, z - half_z, z + half_z, is_round, shape.solid, shape.floor)
+
+
+def _packed(shapes: Sequence[Shape]) -> np.ndarray:
+    return np.array([_packed_row(shape) for shape in shapes], dtype=np.float64).reshape(-1, kernels.N_COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -38,9 +57,17 @@ class SceneSpec:
             raise ValueError(f"Shape names must be unique in a scene, but {repeated} occur(s) more than once.")
         if math.isnan(self.lower_ground) or self.lower_ground == math.inf:
             raise ValueError(f"`lower_ground` must be a height in metres or minus infinity, got {self.lower_ground}.")
-        # Highest floor first: the first one that covers a point is its support.
-        floors = sorted((shape for shape in self.shapes if shape.floor), key=lambda shape: -shape.top)
-        object.__setattr__(self, "_floors", tuple((shape.covers, shape.top) for shape in floors))
+        self._remember({name: i for i, name in enumerate(names)}, _packed(self.shapes))
+
+    def _remember(self, rows: dict[str, int], packed: np.ndarray) -> None:
+        # The fields are all that a scene is; these only make them quick to use.
+        object.__setattr__(self, "_rows", rows)
+        object.__setattr__(self, "_packed", packed)
+
+    @property
+    def packed(self) -> np.ndarray:
+        """The shapes as the functions of ``kernels`` take them, ``(n_shapes, kernels.N_COLUMNS)``; not to be written to."""
+        return self._packed  # type: ignore[attr-defined]
 
     def __getitem__(self, name: str) -> Shape:
         """
@@ -49,10 +76,13 @@ class SceneSpec:
         :param name: its name
         :raises KeyError: if there is none of that name
         """
-        for shape in self.shapes:
-            if shape.name == name:
-                return shape
-        raise KeyError(f"No shape {name!r} in this scene, only {[shape.name for shape in self.shapes]}.")
+        return self.shapes[self._row(name)]
+
+    def _row(self, name: str) -> int:
+        row = self._rows.get(name)  # type: ignore[attr-defined]
+        if row is None:
+            raise KeyError(f"No shape {name!r} in this scene, only {[shape.name for shape in self.shapes]}.")
+        return row
 
     def moved(self, placements: Mapping[str, tuple[Vector3, float]]) -> "SceneSpec":
         """
@@ -61,15 +91,17 @@ class SceneSpec:
         :param placements: name -> (centre in m, yaw in rad)
         :raises KeyError: if a name is unknown
         """
-        for name in placements:
-            self[name]
-        shapes = tuple(
-            dataclasses.replace(shape, centre=placements[shape.name][0], yaw=placements[shape.name][1])
-            if shape.name in placements
-            else shape
-            for shape in self.shapes
-        )
-        return SceneSpec(shapes, self.lower_ground)
+        shapes, packed = list(self.shapes), self.packed.copy()
+        for name, (centre, yaw) in placements.items():
+            row = self._row(name)
+            shapes[row] = dataclasses.replace(shapes[row], centre=centre, yaw=yaw)
+            packed[row] = _packed_row(shapes[row])
+        # Names and the lower ground are those of a scene that has been checked.
+        scene = object.__new__(SceneSpec)
+        object.__setattr__(scene, "shapes", tuple(shapes))
+        object.__setattr__(scene, "lower_ground", self.lower_ground)
+        scene._remember(self._rows, packed)  # type: ignore[attr-defined]
+        return scene
 
     def ground_height(self, x: float, y: float) -> float:
         """
@@ -79,10 +111,7 @@ class SceneSpec:
         :param y: world y, m
         :return: height, m (``lower_ground`` where no floor is, so possibly minus infinity)
         """
-        for covers, top in self._floors:  # type: ignore[attr-defined]
-            if covers(x, y):
-                return top
-        return self.lower_ground
+        return kernels.ground_height(self._packed, self.lower_ground, x, y)  # type: ignore[attr-defined]
 
     def build(self, simulation: "Simulation") -> None:
         """

@@ -3,6 +3,9 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
+from bullet_tasks.ends import Judge, Outcome
+from bullet_tasks.simulation import Simulation
+
 CommandT = TypeVar("CommandT")
 
 
@@ -29,8 +32,19 @@ class RobotState(NamedTuple):
     """Whether something pressed on the body during the substep."""
 
 
+class Stretch(NamedTuple):
+    """What came of some substeps; the robot's state is that after the last of them."""
+
+    substeps: int
+    """How many there were: fewer than asked for if the episode ended."""
+    contacts: int
+    """In how many of them something pressed on the body."""
+    outcome: Outcome
+    """How the episode stands."""
+
+
 class Robot(ABC, Generic[CommandT]):
-    """A robot in a simulation: placed by ``reset``, told by ``command``, moved by ``substep``."""
+    """A robot in a world: placed by ``reset``, told by ``command``, moved by ``substep``."""
 
     name: ClassVar[str] = "robot"
     substep_period: float
@@ -59,3 +73,26 @@ class Robot(ABC, Generic[CommandT]):
     @abstractmethod
     def substep(self) -> RobotState:
         """Let ``substep_period`` pass."""
+
+    def advance(self, n_substeps: int, judge: Judge) -> Stretch:
+        """
+        Let several substeps pass, but stop where the episode ends.
+
+        :param n_substeps: at least 1
+        :param judge: of every substep
+        """
+        done = contacts = 0
+        outcome = Outcome.RUNNING
+        while done < n_substeps and outcome is Outcome.RUNNING:
+            state = self.substep()
+            done += 1
+            contacts += state.in_contact
+            outcome = judge(state)
+        return Stretch(done, contacts, outcome)
+
+    def appear(self, simulation: Simulation) -> None:
+        """
+        Be where ``state`` says in the pictures of a simulation; only a robot that does not live in it has to do anything.
+
+        :param simulation: that will take the picture
+        """

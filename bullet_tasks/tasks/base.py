@@ -1,25 +1,17 @@
 """What every task offers to an environment."""
 
-import enum
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from gymnasium import spaces
 
+from bullet_tasks.ends import Judge, Outcome
 from bullet_tasks.robots.base import RobotState
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Vector3
 from bullet_tasks.simulation import Camera
-
-
-class Outcome(enum.Enum):
-    """How an episode stands."""
-
-    RUNNING = "running"
-    SUCCESS = "success"
-    FAILURE = "failure"
 
 
 class Start(NamedTuple):
@@ -50,6 +42,8 @@ class Task(ABC):
     """What only training knows, ``(n_privileged,)``."""
     camera: ClassVar[Camera]
     """Shows the whole scene."""
+    judge: Judge
+    """Says how this episode stands, set by ``begin``. Compiled robots are fastest if it is an ``Ends``."""
     picture_size: ClassVar[tuple[int, int]]
     """Width and height of a picture that suits the camera, pixels."""
 
@@ -67,11 +61,12 @@ class Task(ABC):
         """
 
     @abstractmethod
-    def begin(self, state: RobotState) -> None:
+    def begin(self, state: RobotState, scene: SceneSpec) -> None:
         """
         Take note of where the robot stands at the start.
 
         :param state: of the robot
+        :param scene: the world of this episode
         """
 
     @abstractmethod
@@ -83,13 +78,14 @@ class Task(ABC):
         :param state: of the robot, now
         """
 
-    @abstractmethod
+    @final
     def outcome(self, state: RobotState) -> Outcome:
         """
         Judge the robot after a substep.
 
         :param state: of the robot
         """
+        return self.judge(state)
 
     @abstractmethod
     def reward_terms(self, state: RobotState, contact_time: float, time_left: float, outcome: Outcome) -> dict[str, float]:

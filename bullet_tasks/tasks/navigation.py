@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium import spaces
 
+from bullet_tasks.ends import Ends
 from bullet_tasks.robots.base import RobotState
-from bullet_tasks.robots.quadruped import WALKING_SPEED, QuadrupedCommand
+from bullet_tasks.robots.quadruped_body import WALKING_SPEED, QuadrupedCommand
+from bullet_tasks.scene import SceneSpec
 from bullet_tasks.tasks.base import Outcome, Task
 
 POSITION_SCALE = 8.0
@@ -75,12 +77,16 @@ class NavigationTask(Task):
     def privileged(self) -> np.ndarray:
         """What only training knows in this episode (see base class)."""
 
-    def begin(self, state: RobotState) -> None:
+    def begin(self, state: RobotState, scene: SceneSpec) -> None:
         """
-        Measure distance and heading error at the start (see base class).
+        Measure distance and heading error, and lay out the ends: goal circle, dead zones, drops (see base class).
 
         :param state: of the robot
+        :param scene: the world of this episode
         """
+        radius = self.goal_radius
+        circles = [(*self.goal, radius, Outcome.SUCCESS), *((*zone, radius, Outcome.FAILURE) for zone in self.dead_zones)]
+        self.judge = Ends(circles, scene, FALL_HEIGHT)
         self._distance, self._heading_error = self._to_goal(state)
 
     def _to_goal(self, state: RobotState) -> tuple[float, float]:
@@ -96,23 +102,6 @@ class NavigationTask(Task):
         :param state: of the robot, now
         """
         return QuadrupedCommand(WALKING_SPEED, state.yaw + MAX_TURN * action[0])
-
-    def outcome(self, state: RobotState) -> Outcome:
-        """
-        Success in the goal circle, failure in a dead zone or over a drop (see base class).
-
-        :param state: of the robot
-        """
-        x, y = state.x, state.y
-        if math.hypot(self.goal[0] - x, self.goal[1] - y) <= self.goal_radius:
-            return Outcome.SUCCESS
-        for zone_x, zone_y in self.dead_zones:
-            if math.hypot(zone_x - x, zone_y - y) <= self.goal_radius:
-                return Outcome.FAILURE
-        # Floors stay where they are, so the scene of any episode will do.
-        if self.scene.ground_height(x, y) < FALL_HEIGHT:
-            return Outcome.FAILURE
-        return Outcome.RUNNING
 
     def reward_terms(self, state: RobotState, contact_time: float, time_left: float, outcome: Outcome) -> dict[str, float]:
         """

@@ -1,4 +1,4 @@
-"""Laws of the kinematic quadruped: it follows its command exactly unless something is in its way."""
+"""Laws of the quadrupeds without legs: they follow their command exactly unless something is in their way."""
 
 import itertools
 import math
@@ -13,23 +13,36 @@ from bullet_tasks.robots.quadruped import (
     QuadrupedCommand,
     make_quadruped,
 )
+from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box
-from bullet_tasks.simulation import Simulation
+from bullet_tasks.world import World
 
 SUBSTEP = 1.0 / 20.0
-WALL = Box("wall", (0.0, 0.0, 0.0), (0.1, 3.0, 1.0))
+WALL = Box("wall", (2.0, 0.0, 0.5), (0.1, 3.0, 1.0))
+DEAD_END = (
+    Box("end", (1.0, 0.0, 0.5), (0.1, 1.0, 0.5)),
+    Box("left", (0.0, 0.35, 0.5), (1.0, 0.1, 0.5)),
+    Box("right", (0.0, -0.35, 0.5), (1.0, 0.1, 0.5)),
+)
+
+
+@pytest.fixture(params=["kinematic", "compiled"])
+def make(request):
+    """Makes a robot in a world of some shapes."""
+    worlds = []
+
+    def make(*shapes):
+        worlds.append(World(SceneSpec(shapes)))
+        return make_quadruped(worlds[-1], request.param)
+
+    yield make
+    for world in worlds:
+        world.close()
 
 
 @pytest.fixture
-def simulation():
-    simulation = Simulation()
-    yield simulation
-    simulation.close()
-
-
-@pytest.fixture
-def robot(simulation):
-    return make_quadruped(simulation)
+def robot(make):
+    return make()
 
 
 def walk(robot, target_yaw, seconds):
@@ -69,8 +82,8 @@ def test_a_heading_beyond_half_a_turn_is_reached_the_shorter_way(robot):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 0.6, 1.2])
-def test_a_wall_stops_the_body_at_its_face_without_tilting_it(simulation, robot, angle):
-    simulation.add_body("wall", WALL, (WALL,), (2.0, 0.0, 0.5))
+def test_a_wall_stops_the_body_at_its_face(make, angle):
+    robot = make(WALL)
     robot.reset(1.5, 0.0, 0.0, angle)
     states = walk(robot, angle, 3.0)
     assert states[-1].in_contact and not states[0].in_contact
@@ -80,27 +93,30 @@ def test_a_wall_stops_the_body_at_its_face_without_tilting_it(simulation, robot,
     assert states[-1].yaw == pytest.approx(angle, abs=1e-3), "it slides along and keeps its heading"
     if angle:
         assert states[-1].vy == pytest.approx(WALKING_SPEED * math.sin(angle), rel=0.02)
-    _, orientation = simulation.client.getBasePositionAndOrientation(simulation.body_id(robot.name))
-    assert abs(orientation[0]) < 1e-5 and abs(orientation[1]) < 1e-5
     # Turned round, it walks off at once.
     away = walk(robot, robot.state.yaw + math.pi, 4.0)
     assert not away[-1].in_contact and away[-1].x < 1.0
 
 
-def test_a_narrow_dead_end_lets_the_body_out_again(simulation, robot):
-    for name, x, y, half in (
-        ("end", 1.0, 0.0, (0.1, 1.0, 0.5)),
-        ("left", 0.0, 0.35, (1.0, 0.1, 0.5)),
-        ("right", 0.0, -0.35, (1.0, 0.1, 0.5)),
-    ):
-        shape = Box(name, (0.0, 0.0, 0.0), half)
-        simulation.add_body(name, shape, (shape,), (x, y, 0.5))
+def test_a_body_that_presses_against_a_wall_does_not_tilt():
+    world = World(SceneSpec((WALL,)))
+    robot = make_quadruped(world, "kinematic")
+    robot.reset(1.5, 0.0, 0.0, 0.3)
+    assert walk(robot, 0.3, 3.0)[-1].in_contact
+    simulation = world.simulation
+    _, orientation = simulation.client.getBasePositionAndOrientation(simulation.body_id(robot.name))
+    assert abs(orientation[0]) < 1e-5 and abs(orientation[1]) < 1e-5
+    world.close()
+
+
+def test_a_narrow_dead_end_lets_the_body_out_again(make):
+    robot = make(*DEAD_END)
     robot.reset(-0.5, 0.0, 0.0, 0.0)
     assert walk(robot, 0.0, 4.0)[-1].in_contact
     assert walk(robot, math.pi, 4.0)[-1].x < 0.0
 
 
 @pytest.mark.parametrize("physics", ["full", "legs"])
-def test_physics_that_does_not_exist_is_refused(simulation, physics):
-    with pytest.raises(ValueError, match=f"{physics}.*available.*kinematic"):
-        make_quadruped(simulation, physics)
+def test_physics_that_does_not_exist_is_refused(physics):
+    with pytest.raises(ValueError, match=f"{physics}.*available.*compiled.*kinematic"):
+        make_quadruped(World(SceneSpec(())), physics)
