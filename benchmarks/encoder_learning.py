@@ -64,7 +64,8 @@ def main() -> None:
         buffer = EpisodeReplayBuffer(space, 1, 1, 0, 1024, 10**9, "all", seed=0)
         buffer.replay.extend(episodes[:N_TRAIN])
         test = buffer.collate(episodes[N_TRAIN:])
-        seen = (test.tokens["common"][..., 0].abs() * POSITION_SCALE > END).cummax(dim=1).values & test.mask
+        at_end = (test.tokens["common"][:, 0].abs() * POSITION_SCALE > END).split(test.lengths.tolist())
+        seen = th.cat([episode.cummax(dim=0).values for episode in at_end])
         encoder = ObservationEncoder(space, 1, memory=name, overrides=sizes)
         optimizer = th.optim.AdamW(encoder.parameters(), LEARNING_RATE, weight_decay=0.0)
         seconds = 0.0
@@ -72,15 +73,14 @@ def main() -> None:
             if update % 100 == 0:
                 with th.no_grad():
                     belief, _ = encoder(test.tokens, test.lengths)
-                nll = gaussian_nll(belief, test.truth, test.mask).item()
-                before, after = belief.std[test.mask & ~seen].mean().item(), belief.std[seen].mean().item()
+                nll = gaussian_nll(belief, test.truth).item()
+                before, after = belief.std[~seen].mean().item(), belief.std[seen].mean().item()
                 print(f"{name:12}{update:>8}{seconds:>9.1f}{nll:>8.2f}{before:>12.3f}{after:>11.3f}", flush=True)
             begin = time.perf_counter()
-            batch = buffer.sample(BATCH)
-            assert batch is not None
+            (batch,) = buffer.batches(1, BATCH)
             if update == 0:
-                encoder.features.update_normalizers({key: value[batch.mask] for key, value in batch.tokens.items()})
-            loss = gaussian_nll(encoder(batch.tokens, batch.lengths)[0], batch.truth, batch.mask)
+                encoder.features.update_normalizers(batch.tokens)
+            loss = gaussian_nll(encoder(batch.tokens, batch.lengths)[0], batch.truth)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             th.nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)

@@ -41,19 +41,14 @@ class Episode:
 
 
 class EpisodeBatch(NamedTuple):
-    """Episodes padded at the end to a common length."""
+    """Whole episodes, one after another."""
 
     tokens: Tokens
-    """Encoder inputs, ``(n_episodes, length, ...)``."""
+    """Encoder inputs, ``(n_tokens, ...)``."""
     truth: th.Tensor
-    """Privileged observations, ``(n_episodes, length, n_privileged)``."""
+    """Privileged observations, ``(n_tokens, n_privileged)``."""
     lengths: th.Tensor
-    """True lengths, ``(n_episodes,)``."""
-
-    @property
-    def mask(self) -> th.Tensor:
-        """Which tokens are real, ``(n_episodes, length)``."""
-        return th.arange(self.truth.shape[1], device=self.lengths.device)[None] < self.lengths[:, None]
+    """Lengths of the episodes, ``(n_episodes,)``."""
 
 
 class EpisodeReplayBuffer:
@@ -72,6 +67,9 @@ class EpisodeReplayBuffer:
         in them the behaviour says nothing about the truth. "all" replays every episode, as the paper's Alg. 1 says.
     :param seed: of the sampling
     """
+
+    STAGED_BATCHES = 16
+    """Encoder updates whose episodes are on the device at the same time."""
 
     def __init__(
         self,
@@ -141,51 +139,67 @@ class EpisodeReplayBuffer:
         while self.nbytes > self.max_bytes:
             self.nbytes -= self.replay.popleft().nbytes
 
-    def sample(self, n_tokens: int, device: th.device | str = "cpu") -> EpisodeBatch | None:
+    def batches(self, n_batches: int, n_tokens: int, device: th.device | str = "cpu") -> Generator[EpisodeBatch, None, None]:
         """
-        Whole episodes, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one if the other is empty.
+        Draw whole episodes, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one if the other is
+        empty. Nothing comes before the first episode has ended.
 
-        :param n_tokens: about how many decisions
+        Tokens go to the device once for every ``STAGED_BATCHES`` batches, which are then put together there.
+
+        :param n_batches: number of batches
+        :param n_tokens: about how many decisions in each
         :param device: of the tensors
-        :return: padded batch; None before the first episode has ended
         """
+        for first in range(0, n_batches, self.STAGED_BATCHES):
+            chosen = [self._choose(n_tokens) for _ in range(first, min(first + self.STAGED_BATCHES, n_batches))]
+            if not chosen[0]:
+                return
+            unique = list({id(episode): episode for episodes in chosen for episode in episodes}.values())
+            starts = dict(zip(map(id, unique), np.cumsum([0, *map(len, unique)]).tolist(), strict=False))
+            staged = self.collate(unique, device)
+            lengths = [np.array([len(episode) for episode in episodes]) for episodes in chosen]
+            places = [
+                np.concatenate([np.arange(starts[id(episode)], starts[id(episode)] + len(episode)) for episode in episodes])
+                for episodes in chosen
+            ]
+            all_lengths = th.as_tensor(np.concatenate(lengths), device=device).split([len(part) for part in lengths])
+            all_places = th.as_tensor(np.concatenate(places), device=device).split([len(part) for part in places])
+            for place, length in zip(all_places, all_lengths, strict=True):
+                yield EpisodeBatch({key: value[place] for key, value in staged.tokens.items()}, staged.truth[place], length)
+
+    def _choose(self, n_tokens: int) -> list[Episode]:
         sources = [source for source in (self.fresh, self.replay) if source]
-        if not sources:
-            return None
         episodes: list[Episode] = []
         for source in sources:
             count = 0
             while count < n_tokens / len(sources):
                 episodes.append(source[int(self.rng.integers(len(source)))])
                 count += len(episodes[-1])
-        return self.collate(episodes, device)
+        return episodes
 
     def running_tokens(self, device: th.device | str = "cpu") -> tuple[Tokens, th.Tensor]:
         """
         The past of the running episodes, without the current observation.
 
         :param device: of the tensors
-        :return: tokens ``(n_envs, longest, ...)`` and lengths ``(n_envs,)``
+        :return: tokens, one episode after another, ``(n_tokens, ...)``, and lengths ``(n_envs,)``
         """
-        longest = max(int(self.lengths.max()), 1)
-        tokens = {key: th.as_tensor(array[:, :longest], device=device) for key, array in self.running.items() if key != TRUTH}
+        mask = np.arange(self._capacity) < self.lengths[:, None]
+        tokens = {key: th.as_tensor(array[mask], device=device) for key, array in self.running.items() if key != TRUTH}
         return tokens, th.as_tensor(self.lengths, device=device)
 
     def collate(self, episodes: Sequence[Episode], device: th.device | str = "cpu") -> EpisodeBatch:
         """
         :param episodes: episodes of any length
         :param device: of the tensors
-        :return: padded batch
+        :return: all of them, one after another
         """
-        lengths = np.array([len(episode) for episode in episodes])
-        padded = {}
-        for key, (shape, dtype) in self._spec.items():
-            array = np.zeros((len(episodes), lengths.max(), *shape), dtype)
-            for row, episode in enumerate(episodes):
-                array[row, : len(episode)] = episode.arrays[key]
-            padded[key] = th.as_tensor(array, device=device)
-        truth = padded.pop(TRUTH)
-        return EpisodeBatch(padded, truth, th.as_tensor(lengths, device=device))
+        lengths = th.as_tensor([len(episode) for episode in episodes], device=device)
+        tokens = {
+            key: th.as_tensor(np.concatenate([episode.arrays[key] for episode in episodes]), device=device)
+            for key in self._spec
+        }
+        return EpisodeBatch(tokens, tokens.pop(TRUTH), lengths)
 
     def _grow(self, capacity: int) -> None:
         if capacity > self.context_length:

@@ -399,7 +399,13 @@ class USPLPPO(PPO):
         wrapper.redraw_mismatch()
         if self._action_std_schedule is not None:
             self.policy.set_action_std(self._action_std_schedule(self._current_progress_remaining))
-        return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
+        # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.
+        threads = th.get_num_threads()
+        th.set_num_threads(1)
+        try:
+            return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
+        finally:
+            th.set_num_threads(threads)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         """Episode statistics of the privileged policy, without the mismatched environments."""
@@ -432,28 +438,24 @@ class USPLPPO(PPO):
         update_learning_rate(optimizer, learning_rate)
         self.logger.record("encoder/learning_rate", learning_rate)
         encoder.train()
-        losses, errors, stds = [], [], []
-        for update in range(self.encoder_updates):
-            batch = episodes.sample(self.encoder_batch_size, self.device)
-            if batch is None:
-                return
-            mask = batch.mask
+        metrics = []
+        batches = episodes.batches(self.encoder_updates, self.encoder_batch_size, self.device)
+        for update, (tokens, truth, lengths) in enumerate(batches):
             if update == 0:
-                encoder.features.update_normalizers({key: value[mask] for key, value in batch.tokens.items()})
-            belief, _ = encoder(batch.tokens, batch.lengths)
-            loss = gaussian_nll(belief, batch.truth, mask)
+                encoder.features.update_normalizers(tokens)
+            belief, _ = encoder(tokens, lengths)
+            loss = gaussian_nll(belief, truth)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             th.nn.utils.clip_grad_norm_(encoder.parameters(), self.encoder_max_grad_norm)
             optimizer.step()
-            losses.append(loss.item())
-            errors.append((belief.mean - batch.truth)[mask].abs().mean().item())
-            stds.append(belief.std[mask].mean().item())
+            with th.no_grad():
+                metrics.append(th.stack((loss, (belief.mean - truth).abs().mean(), belief.std.mean())))
         # PPO clips the gradients of the whole policy; the encoder's must not be among them.
         optimizer.zero_grad(set_to_none=True)
-        self.logger.record("encoder/nll", float(np.mean(losses)))
-        self.logger.record("encoder/error", float(np.mean(errors)))
-        self.logger.record("encoder/std", float(np.mean(stds)))
+        if metrics:
+            for name, value in zip(("nll", "error", "std"), th.stack(metrics).mean(0).tolist(), strict=True):
+                self.logger.record(f"encoder/{name}", value)
 
     # -- saving ------------------------------------------------------------------------------------------------------------
 

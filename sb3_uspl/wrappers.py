@@ -162,18 +162,18 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         """
         Recompute every memory with the updated encoder in one pass, so that none mixes two encoders' states.
 
-        :param tokens: past of the running episodes without the current observation, ``(n_envs, longest, ...)``
+        :param tokens: past of the running episodes without the current observation, one after another, ``(n_tokens, ...)``
         :param lengths: number of past tokens, ``(n_envs,)``
         """
         _, self.memory = self.encoder(tokens, lengths)
-        _, self.memory = self.encoder.step(self._tokens, self.memory)
+        _, self.memory = self.encoder.step(self._tokens, self.memory, int(self.step_count.max()))
 
     def _observe(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Encode the current observation of all environments and build what the policy sees."""
         check_finite(obs)
         self._tokens = self._as_tokens(obs, self.previous_action)
         with th.no_grad():
-            belief, self.memory = self.encoder.step(self._tokens, self.memory)
+            belief, self.memory = self.encoder.step(self._tokens, self.memory, int(self.step_count.max()))
         mean = belief.mean.cpu().numpy()
         self.std = smooth(self.std, belief.std.cpu().numpy(), self.config.smoothing)
         self.noise.redraw(np.flatnonzero(self.step_count % self.config.noise_hold == 0))
@@ -194,7 +194,8 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         check_finite(last)
         with th.no_grad():
             memory = take_rows(self.memory, th.as_tensor(rows, device=self.device))
-            belief, _ = self.encoder.step(self._as_tokens(last, self.previous_action[rows]), memory)
+            tokens = self._as_tokens(last, self.previous_action[rows])
+            belief, _ = self.encoder.step(tokens, memory, int(self.step_count[rows].max()))
         std = smooth(self.std[rows], belief.std.cpu().numpy(), self.config.smoothing)
         shown = self._blur(last[PRIVILEGED], std, rows)
         terminal = self._assemble(last, shown, belief.mean.cpu().numpy(), std)

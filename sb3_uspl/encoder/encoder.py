@@ -56,18 +56,16 @@ def soft_clamp(x: th.Tensor, low: float, high: float) -> th.Tensor:
     return low + F.softplus(x - low)
 
 
-def gaussian_nll(belief: Belief, truth: th.Tensor, mask: th.Tensor) -> th.Tensor:
+def gaussian_nll(belief: Belief, truth: th.Tensor) -> th.Tensor:
     """
-    Negative log-likelihood of the truth, Eq. 1: summed over privileged dimensions, averaged over the tokens that count.
+    Negative log-likelihood of the truth, Eq. 1: summed over privileged dimensions, averaged over tokens.
 
-    :param belief: predicted Gaussians, ``(n_episodes, length, n_privileged)``
+    :param belief: predicted Gaussians, ``(n_tokens, n_privileged)``
     :param truth: privileged observations, same shape
-    :param mask: which tokens are real, ``(n_episodes, length)``
     :return: scalar loss
     """
     z = (truth - belief.mean) * th.exp(-belief.log_std)
-    nll = (0.5 * z**2 + belief.log_std + 0.5 * math.log(2.0 * math.pi)).sum(-1)
-    return (nll * mask).sum() / mask.sum()
+    return (0.5 * z**2 + belief.log_std + 0.5 * math.log(2.0 * math.pi)).sum(-1).mean()
 
 
 class ObservationEncoder(nn.Module):
@@ -124,22 +122,23 @@ class ObservationEncoder(nn.Module):
         """
         Beliefs along whole episodes.
 
-        :param tokens: encoder inputs, ``(n_episodes, length, ...)``, padded at the end
-        :param lengths: true lengths, ``(n_episodes,)``
-        :return: beliefs ``(n_episodes, length, n_privileged)`` and the memory after each episode's last token
+        :param tokens: encoder inputs of whole episodes, one after another, ``(n_tokens, ...)``
+        :param lengths: of the episodes, ``(n_episodes,)``
+        :return: beliefs ``(n_tokens, n_privileged)`` and the memory after each episode's last token
         """
         memory, state = self.memory(self.features(tokens), lengths)
         return self._belief(memory), state
 
-    def step(self, tokens: Tokens, state: MemoryState) -> tuple[Belief, MemoryState]:
+    def step(self, tokens: Tokens, state: MemoryState, longest: int | None = None) -> tuple[Belief, MemoryState]:
         """
         Beliefs after one more token per environment.
 
         :param tokens: encoder inputs, ``(n_envs, ...)``
         :param state: memory state; may be overwritten
+        :param longest: see :meth:`Memory.step`
         :return: beliefs ``(n_envs, n_privileged)`` and the next state
         """
-        memory, state = self.memory.step(self.features(tokens), state)
+        memory, state = self.memory.step(self.features(tokens), state, longest)
         return self._belief(memory), state
 
     def _belief(self, memory: th.Tensor) -> Belief:

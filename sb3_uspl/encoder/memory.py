@@ -6,6 +6,8 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_uspl.encoder.recurrence import PackedGRU
+
 MemoryState = tuple[th.Tensor, ...]
 """What a memory carries from one decision to the next; every tensor has the environments as its first axis."""
 
@@ -32,11 +34,27 @@ def take_rows(state: MemoryState, rows: th.Tensor) -> MemoryState:
     return tuple(tensor[rows] for tensor in state)
 
 
+def token_mask(lengths: th.Tensor) -> th.Tensor:
+    """
+    Which places of a table of sequences hold a token.
+
+    :param lengths: of the sequences, ``(n_sequences,)``
+    :return: ``(n_sequences, longest)``
+    """
+    return th.arange(int(lengths.max()), device=lengths.device) < lengths[:, None]
+
+
+def _padded(features: th.Tensor, mask: th.Tensor) -> th.Tensor:
+    table = features.new_zeros(*mask.shape, features.shape[1])
+    table[mask] = features
+    return table
+
+
 class Memory(nn.Module, ABC):
     """
     Turns the features seen so far in an episode into one vector per decision.
 
-    ``forward`` over a whole episode and ``step`` over its tokens one by one give the same outputs.
+    ``forward`` over whole sequences and ``step`` over their tokens one by one give the same outputs.
 
     :param width: number of features of input and output
     """
@@ -52,19 +70,27 @@ class Memory(nn.Module, ABC):
         :return: all-zero state
         """
 
-    @abstractmethod
     def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
         """
-        :param features: whole episodes, ``(n_episodes, length, width)``, padded at the end
-        :param lengths: true lengths, ``(n_episodes,)``; 0 is allowed
-        :return: outputs, same shape as the features, and the state after each episode's last token
+        :param features: whole sequences, one after another, ``(n_tokens, width)``
+        :param lengths: of the sequences, ``(n_sequences,)``; 0 is allowed
+        :return: outputs, same shape as the features, and the state after each sequence's last token
         """
+        if len(features) == 0:
+            return features, self.initial_state(len(lengths))
+        return self._remember(features, lengths)
 
     @abstractmethod
-    def step(self, features: th.Tensor, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
+    def _remember(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        """:meth:`forward` with at least one token."""
+
+    @abstractmethod
+    def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
         """
         :param features: one token per environment, ``(n_envs, width)``
         :param state: memory state; may be overwritten
+        :param longest: most tokens that any environment has had before; None looks it up in the state, which makes the host
+            wait for the device
         :return: outputs ``(n_envs, width)`` and the next state
         """
 
@@ -83,14 +109,32 @@ class GRUMemory(Memory):
     def initial_state(self, n_envs: int) -> MemoryState:
         return (th.zeros(n_envs, self.width, device=next(self.parameters()).device),)
 
-    def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
-        outputs, _ = self.gru(features)
-        rows = th.arange(len(features), device=features.device)
-        last = outputs[rows, (lengths - 1).clamp(min=0)]
-        # The output of a one-layer GRU is its state; an empty episode leaves the initial state.
+    def _remember(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        outputs = self._on_gpu(features, lengths) if features.is_cuda else self._on_cpu(features, lengths)
+        # The output of a one-layer GRU is its state; an empty sequence leaves the initial state.
+        last = outputs[(lengths.cumsum(0) - 1).clamp(min=0)]
         return outputs, (th.where(lengths[:, None] > 0, last, th.zeros_like(last)),)
 
-    def step(self, features: th.Tensor, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
+    def _on_gpu(self, features: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+        mask = token_mask(lengths)
+        return self.gru(_padded(features, mask))[0][mask]
+
+    def _on_cpu(self, features: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+        input_weight, hidden_weight, input_bias, hidden_bias = self.gru.parameters()
+        # Token by time, the longest sequences first, as torch's PackedSequence has them.
+        lengths, order = th.sort(lengths, descending=True)
+        mask = token_mask(lengths).t()
+        starts = features.new_zeros(len(lengths), dtype=th.long)
+        starts[order] = lengths
+        starts = (starts.cumsum(0) - starts)[order]
+        by_time = (starts + th.arange(len(mask))[:, None])[mask]
+        back = th.empty_like(by_time)
+        back[by_time] = th.arange(len(by_time))
+        gates = F.linear(features.index_select(0, by_time), input_weight, input_bias)
+        hidden = PackedGRU.apply(gates, hidden_weight, hidden_bias, mask.sum(1).tolist())
+        return hidden.index_select(0, back)
+
+    def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
         outputs, hidden = self.gru(features[:, None], state[0][None].contiguous())
         return outputs[:, 0], (hidden[0],)
 
@@ -133,14 +177,16 @@ class TransformerMemory(Memory):
             th.zeros(n_envs, dtype=th.long, device=device),
         )
 
-    def forward(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
-        n_tokens = features.shape[1]
+    def _remember(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        mask = token_mask(lengths)
+        n_tokens = mask.shape[1]
+        padded = _padded(features, mask)
         position = th.arange(n_tokens, device=features.device)
         bias = self._bias(position[:, None], position[None, :])
         keys, values = [], []
         for block in self.blocks:
-            q, k, v = block.project(features)
-            features = block.finish(features, F.scaled_dot_product_attention(q, k, v, attn_mask=bias))
+            q, k, v = block.project(padded)
+            padded = block.finish(padded, F.scaled_dot_product_attention(q, k, v, attn_mask=bias))
             keys.append(k)
             values.append(v)
         capacity = self.CACHE_BLOCK
@@ -148,12 +194,12 @@ class TransformerMemory(Memory):
             capacity *= 2
         padding = (0, 0, 0, capacity - n_tokens)
         state = (F.pad(th.stack(keys, 1).detach(), padding), F.pad(th.stack(values, 1).detach(), padding), lengths.clone())
-        return self.out(self.norm(features)), state
+        return self.out(self.norm(padded[mask])), state
 
-    def step(self, features: th.Tensor, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
+    def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
         keys, values, length = state
-        n_tokens = int(length.max()) + 1
-        if n_tokens > keys.shape[3]:
+        n_tokens = (int(length.max()) if longest is None else longest) + 1
+        while n_tokens > keys.shape[3]:
             padding = (0, 0, 0, keys.shape[3])
             keys, values = F.pad(keys, padding), F.pad(values, padding)
         rows = th.arange(len(features), device=features.device)

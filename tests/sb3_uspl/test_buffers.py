@@ -50,13 +50,18 @@ def test_episodes_come_out_as_they_went_in():
             np.testing.assert_array_equal(episode.arrays["target"][:, 0, 0, 0], number * length + np.arange(length))
 
 
-def test_batches_are_padded_and_masked():
+def test_batches_are_whole_episodes_one_after_another():
     episodes = make_episodes()
     fill(episodes, [3, 5, 9, 7], 20)
-    batch = episodes.sample(200)
-    assert batch.mask.sum() == batch.lengths.sum() >= 200
-    assert batch.truth.shape[:2] == batch.mask.shape == batch.tokens["common"].shape[:2]
-    assert (batch.tokens["common"][~batch.mask] == 0).all()
+    stored = {(e.arrays["truth"][0, 0], *e.arrays["common"][:, 0]) for e in episodes.fresh}
+    batches = list(episodes.batches(EpisodeReplayBuffer.STAGED_BATCHES + 2, 50))
+    assert len(batches) == EpisodeReplayBuffer.STAGED_BATCHES + 2
+    for batch in batches:
+        lengths = batch.lengths.tolist()
+        assert 50 <= sum(lengths) == len(batch.truth) < 50 + 9
+        for truth, common in zip(batch.truth.split(lengths), batch.tokens["common"].split(lengths), strict=True):
+            assert (truth == truth[0]).all() and (truth[0, 0].item(), *common[:, 0].tolist()) in stored
+    assert len({tuple(batch.tokens["common"][:, 0].tolist()) for batch in batches}) > 1
 
 
 def test_half_of_a_batch_is_fresh_and_half_replayed():
@@ -65,7 +70,8 @@ def test_half_of_a_batch_is_fresh_and_half_replayed():
     episodes.end_iteration()
     for t in range(21, 42):
         episodes.add(observation([t % 5] * 4, t))
-    first_value = episodes.sample(10_000).tokens["common"][:, 0, 0]
+    (batch,) = episodes.batches(1, 10_000)
+    first_value = batch.tokens["common"][::5, 0]
     assert ((first_value >= 20).float().mean() - 0.5).abs() < 0.05
 
 
@@ -111,7 +117,7 @@ def test_an_episode_longer_than_the_context_is_refused():
 
 
 def test_nothing_to_sample_before_the_first_end():
-    assert make_episodes().sample(10) is None
+    assert list(make_episodes().batches(3, 10)) == []
 
 
 def test_mismatched_environments_never_enter_the_loss():

@@ -46,30 +46,63 @@ def test_steps_equal_whole_episodes_across_resets_and_cache_growth(name):
         for env, times in resets.items():
             edges = [0, *times, n_tokens]
             for start, stop in itertools.pairwise(edges):
-                whole, _ = memory(features[env : env + 1, start:stop], th.tensor([stop - start]))
-                th.testing.assert_close(outputs[env, start:stop], whole[0], atol=1e-5, rtol=1e-4)
+                whole, _ = memory(features[env, start:stop], th.tensor([stop - start]))
+                th.testing.assert_close(outputs[env, start:stop], whole, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_state_after_a_padded_pass_continues_like_single_steps(name):
-    memory = make_memory(name)
-    features, lengths, token = th.randn(3, 10, 16), th.tensor([10, 4, 0]), th.randn(3, 16)
+def test_sequences_do_not_reach_into_each_other(name):
+    memory, lengths = make_memory(name), th.tensor([3, 0, 7, 1, 7])
+    features = th.randn(int(lengths.sum()), 16)
     with th.no_grad():
-        _, state = memory(features, lengths)
-        after_pass, _ = memory.step(token, state)
-        for env, length in enumerate(lengths):
+        together, _ = memory(features, lengths)
+        alone = [memory(part, th.tensor([len(part)]))[0] for part in features.split(lengths.tolist())]
+    th.testing.assert_close(together, th.cat(alone), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+@pytest.mark.parametrize("longest", [None, 10, 200])
+def test_state_after_whole_sequences_continues_like_single_steps(name, longest):
+    memory = make_memory(name)
+    lengths, token = th.tensor([10, 4, 0]), th.randn(3, 16)
+    parts = [th.randn(int(length), 16) for length in lengths]
+    with th.no_grad():
+        _, state = memory(th.cat(parts), lengths)
+        after_pass, _ = memory.step(token, state, longest)
+        for env, part in enumerate(parts):
             single = memory.initial_state(1)
-            for t in range(length):
-                _, single = memory.step(features[env : env + 1, t], single)
+            for features in part:
+                _, single = memory.step(features[None], single)
             expected, _ = memory.step(token[env : env + 1], single)
             th.testing.assert_close(after_pass[env], expected[0], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_no_tokens_leave_the_initial_state(name):
+    memory = make_memory(name)
+    outputs, state = memory(th.zeros(0, 16), th.tensor([0, 0]))
+    assert len(outputs) == 0 and all((part == 0).all() and len(part) == 2 for part in state)
+
+
+def test_the_compiled_recurrence_is_torchs_gru():
+    """Outputs and all gradients, on sequences of any lengths."""
+    memory, lengths = make_memory("gru"), [5, 9, 1, 9]
+    features = th.randn(sum(lengths), 16, requires_grad=True)
+    weights = th.randn(sum(lengths), 16)
+    inputs = [features, *memory.parameters()]
+    ours = memory(features, th.tensor(lengths))[0]
+    reference = th.cat([memory.gru(part[None])[0][0] for part in features.split(lengths)])
+    th.testing.assert_close(ours, reference, atol=1e-6, rtol=1e-5)
+    gradients = [th.autograd.grad((outputs * weights).sum(), inputs) for outputs in (ours, reference)]
+    for mine, theirs in zip(*gradients, strict=True):
+        th.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_taken_rows_are_independent(name):
     memory = make_memory(name)
     with th.no_grad():
-        _, state = memory(th.randn(2, 5, 16), th.tensor([5, 5]))
+        _, state = memory(th.randn(10, 16), th.tensor([5, 5]))
         before = [part.clone() for part in state]
         memory.step(th.randn(1, 16), take_rows(state, th.tensor([1])))
     for part, old in zip(state, before, strict=True):
@@ -78,21 +111,21 @@ def test_taken_rows_are_independent(name):
 
 def test_the_future_does_not_reach_the_past():
     memory = make_memory("transformer")
-    features = th.randn(1, 6, 16)
+    features = th.randn(6, 16)
     changed = features.clone()
-    changed[:, 4:] += 1.0
+    changed[4:] += 1.0
     with th.no_grad():
         a, b = memory(features, th.tensor([6]))[0], memory(changed, th.tensor([6]))[0]
-    th.testing.assert_close(a[:, :4], b[:, :4])
-    assert not th.allclose(a[:, 4:], b[:, 4:])
+    th.testing.assert_close(a[:4], b[:4])
+    assert not th.allclose(a[4:], b[4:])
 
 
 def test_eq_1_hand_computed():
-    belief = Belief(th.tensor([[[0.0, 1.0], [5.0, 5.0]]]), th.log(th.tensor([[[0.5, 2.0], [1.0, 1.0]]])))
-    truth = th.tensor([[[0.5, 1.0], [0.0, 0.0]]])
-    # First token: z = 1 and 0; the second one is padding.
-    expected = 0.5 + math.log(0.5) + math.log(2.0) + math.log(2 * math.pi)
-    assert gaussian_nll(belief, truth, th.tensor([[True, False]])).item() == pytest.approx(expected)
+    belief = Belief(th.tensor([[0.0, 1.0], [5.0, 5.0]]), th.log(th.tensor([[0.5, 2.0], [1.0, 1.0]])))
+    truth = th.tensor([[0.5, 1.0], [5.0, 6.0]])
+    # Half squared z: 0.5, 0, 0, 0.5.
+    expected = (0.5 + math.log(0.5) + math.log(2.0) + 0.5 + 2 * math.log(2 * math.pi)) / 2
+    assert gaussian_nll(belief, truth).item() == pytest.approx(expected)
 
 
 def test_soft_clamp_stays_inside_and_keeps_a_gradient():
@@ -127,11 +160,11 @@ def test_normalizer_statistics_equal_those_of_all_data():
 @pytest.mark.parametrize("target", [None, spaces.Box(-1, 1, (7,), np.float32), IMAGE], ids=["blind", "vector", "image"])
 def test_every_preset_handles_every_input(preset, memory, target):
     encoder = ObservationEncoder(ToyEnv(target=target, n_privileged=2).observation_space, 3, preset, memory)
-    tokens = {"common": th.randn(2, 4, 2), "previous_action": th.randn(2, 4, 3)}
+    tokens = {"common": th.randn(7, 2), "previous_action": th.randn(7, 3)}
     if target is not None:
-        tokens["target"] = th.as_tensor(np.stack([np.stack([target.sample() for _ in range(4)]) for _ in range(2)]))
+        tokens["target"] = th.as_tensor(np.stack([target.sample() for _ in range(7)]))
     belief, _ = encoder(tokens, th.tensor([4, 3]))
-    assert belief.mean.shape == belief.std.shape == (2, 4, 2)
+    assert belief.mean.shape == belief.std.shape == (7, 2)
 
 
 def test_the_paper_preset_has_the_papers_transformer():
@@ -154,14 +187,14 @@ def test_either_memory_learns_what_was_revealed_and_says_when(memory):
     sign = 2.0 * th.randint(0, 2, (256, 1)) - 1.0
     common = th.zeros(256, 8, 2)
     common[:, 2, 1] = sign[:, 0]
-    tokens = {"common": common, "previous_action": th.zeros(256, 8, 1)}
-    truth = (0.25 * sign)[:, None].expand(-1, 8, -1)
-    lengths, mask = th.full((256,), 8), th.ones(256, 8, dtype=th.bool)
+    tokens = {"common": common.flatten(0, 1), "previous_action": th.zeros(256 * 8, 1)}
+    truth = (0.25 * sign).repeat_interleave(8, dim=0)
+    lengths = th.full((256,), 8)
     for _ in range(150):
-        loss = gaussian_nll(encoder(tokens, lengths)[0], truth, mask)
+        loss = gaussian_nll(encoder(tokens, lengths)[0], truth)
         optimizer.zero_grad()
         loss.backward()
         th.nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)
         optimizer.step()
-    std = encoder(tokens, lengths)[0].std.mean(0)[:, 0]
+    std = encoder(tokens, lengths)[0].std.view(256, 8).mean(0)
     assert std[:2].min() > 3 * std[3:].max()

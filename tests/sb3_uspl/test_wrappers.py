@@ -25,11 +25,11 @@ def make_wrapper(n_envs=4, memory="gru", env_kwargs=None, seed=0, **config):
 
 def beliefs_from_scratch(encoder, tokens):
     """Belief after the last of a list of (common, previous action), as one uncached pass."""
-    common = th.as_tensor(np.stack([c for c, _ in tokens]))[None]
-    action = th.as_tensor(np.stack([a for _, a in tokens]))[None]
+    common = th.as_tensor(np.stack([c for c, _ in tokens]))
+    action = th.as_tensor(np.stack([a for _, a in tokens]))
     with th.no_grad():
         belief, _ = encoder({"common": common, "previous_action": action}, th.tensor([len(tokens)]))
-    return belief.mean[0, -1].numpy(), belief.std[0, -1].numpy()
+    return belief.mean[-1].numpy(), belief.std[-1].numpy()
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
@@ -157,10 +157,8 @@ def test_rebuilding_the_memory_with_the_same_encoder_changes_nothing(memory):
             past[i].append((obs["common"][i], obs["previous_action"][i]))
         obs, _, dones, _ = wrapper.step(np.random.default_rng(0).uniform(-1, 1, (3, 1)).astype(np.float32))
         past = [[] if done else p for done, p in zip(dones, past, strict=True)]
-    tokens = {"common": th.zeros(3, 6, 2), "previous_action": th.zeros(3, 6, 1)}
-    for i, tokens_i in enumerate(past):
-        for t, (common, action) in enumerate(tokens_i):
-            tokens["common"][i, t], tokens["previous_action"][i, t] = th.as_tensor(common), th.as_tensor(action)
+    common, action = (np.array([token[key] for tokens in past for token in tokens]) for key in (0, 1))
+    tokens = {"common": th.as_tensor(common), "previous_action": th.as_tensor(action)}
     old = wrapper.encoder.step(wrapper._tokens, tuple(part.clone() for part in wrapper.memory))[0]
     wrapper.rebuild_memory(tokens, th.tensor([len(p) for p in past]))
     new = wrapper.encoder.step(wrapper._tokens, wrapper.memory)[0]
