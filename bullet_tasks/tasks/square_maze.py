@@ -244,9 +244,7 @@ class SquareMaze(CornerTask):
             goes_on.add("east" if sign_x > 0.0 else "west")
         placements: dict[str, tuple[Vector3, float]] = {"goal": ((*self.goal, 0.0), 0.0)}
         for name in _POCKETS:
-            opened, closed = self._open[name], (self._closed[name],)
-            standing, parked = (opened, closed) if name in goes_on else (closed, opened)
-            placements |= {shape.name: (shape.centre, shape.yaw) for shape in standing}
+            parked = (self._closed[name],) if name in goes_on else self._open[name]
             placements |= {shape.name: (PARKED, 0.0) for shape in parked}
         return Start(0.0, self.config.spawn_y, -0.5 * math.pi, placements)
 

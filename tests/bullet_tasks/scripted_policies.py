@@ -163,6 +163,63 @@ class MazeProbe:
         return self.route(observation)
 
 
+def scandots_in_world(observation: dict[str, np.ndarray], points: np.ndarray) -> np.ndarray:
+    """
+    Where the scandots of an observation are, m, ``(n_points, 2)``.
+
+    :param observation: ``common`` is read, nothing else
+    :param points: forward and left coordinates of the scandots, m, ``(n_points, 2)``
+    """
+    c, s = map(float, observation["common"][2:])
+    return np.array(position(observation)) + points @ np.array([[c, s], [-s, c]])
+
+
+class SignReader:
+    """
+    Solve Signpost Nav without privileged knowledge: walk to the signpost and keep the goals that fit the scandots.
+
+    :param points: of the scandots, m, ``(n_points, 2)``
+    """
+
+    N_GOALS = 2500
+    POST = np.array([4.65, 0.0])  # m
+    HALF_THICKNESS = 0.15  # m
+    READING_PLACE = (3.0, 0.0)  # m; the longest signpost ends 0.45 m further
+    IN_SIGHT = 1.4  # m from the signpost's centre, a little more than half of the longest
+    TALLER = -0.25  # m; a reading below this is on the signpost
+
+    def __init__(self, points: np.ndarray) -> None:
+        rng = np.random.default_rng(0)
+        distance, angle = rng.uniform(1.3, 3.325, self.N_GOALS), rng.uniform(-math.pi, math.pi, self.N_GOALS)
+        self.goals = np.stack((distance * np.cos(angle), distance * np.sin(angle)), axis=1)
+        ways = self.goals - self.POST
+        distances = np.hypot(*ways.T)
+        self.axes = ways / distances[:, None]
+        self.half_lengths = 0.4 + 0.1 * distances
+        self.misfits = np.zeros(self.N_GOALS)
+        self.points = points
+        self.has_read = False
+
+    def estimate(self) -> tuple[float, float]:
+        """The middle of the goals that fit best, m."""
+        x, y = self.goals[self.misfits == self.misfits.min()].mean(axis=0)
+        return float(x), float(y)
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """
+        :param observation: ``common`` and ``target`` are read, nothing else
+        """
+        offsets = scandots_in_world(observation, self.points) - self.POST
+        near = np.hypot(*offsets.T) < self.IN_SIGHT
+        if near.any():
+            along = self.axes @ offsets[near].T
+            across = np.stack((-self.axes[:, 1], self.axes[:, 0]), axis=1) @ offsets[near].T
+            on_post = (np.abs(along) <= self.half_lengths[:, None]) & (np.abs(across) <= self.HALF_THICKNESS)
+            self.misfits += (on_post != (observation["target"][near] < self.TALLER)).sum(axis=1)
+        self.has_read = self.has_read or math.dist(position(observation), self.READING_PLACE) < NEAR
+        return towards(observation, self.estimate() if self.has_read else self.READING_PLACE)
+
+
 def run_episode(env: gymnasium.Env, policy: Policy, seed: int | None = None) -> Episode:
     """
     Run one episode.

@@ -31,9 +31,9 @@ CARD_SECTIONS = (
 )
 
 
-@pytest.fixture
-def env():
-    env = gymnasium.make("SquareMaze-v0")
+@pytest.fixture(params=["kinematic", "compiled"])
+def env(request):
+    env = gymnasium.make("SquareMaze-v0", physics=request.param)
     yield env
     env.close()
 
@@ -138,7 +138,7 @@ def test_nobody_leaves_the_maze(env):
     for _ in range(1500):
         _, _, terminated, truncated, info = env.step(env.action_space.sample())
         seen.append(info["position"])
-        assert env.unwrapped.task.scene.ground_height(*info["position"]) == 0.0
+        assert env.unwrapped.world.scene.ground_height(*info["position"]) == 0.0
         if terminated or truncated:
             env.reset()
     assert np.ptp(np.array(seen), axis=0).min() > 2.0, "the walk has tried many curbs"
