@@ -2,65 +2,17 @@
 
 import math
 
-import numba
 import numpy as np
 from gymnasium import spaces
 
 from bullet_tasks.robots.base import RobotState
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.sensors.base import Sensor
-from bullet_tasks.sensors.scene_arrays import COS, HALF_X, HALF_Y, ROUND, SIN, TOP, SceneArrays, X, Y, pack
+from bullet_tasks.sensors.ray_casting import look_down
+from bullet_tasks.sensors.scene_arrays import SceneArrays, pack
 
 _GRID_TOLERANCE = 1e-6
 """How far a range may be from a whole number of spacings, in spacings."""
-
-
-@numba.njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
-def _scan(
-    shapes: np.ndarray,
-    starts: np.ndarray,
-    ground: np.ndarray,
-    poses: np.ndarray,
-    points: np.ndarray,
-    reach: float,
-    standing_height: float,
-    limit: float,
-    out: np.ndarray,
-) -> None:
-    """See ``scan``; ``points`` is ``(2, n_points)`` here and ``reach`` the distance of the furthest of them."""
-    n_points = points.shape[1]
-    along, across = points[0], points[1]
-    heights = np.empty(n_points)
-    for i in range(len(poses)):
-        x, y, z, yaw = poses[i]
-        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-        heights[:] = ground[i]
-        for k in range(starts[i], starts[i + 1]):
-            dx, dy = x - shapes[k, X], y - shapes[k, Y]
-            half_x, half_y, top = shapes[k, HALF_X], shapes[k, HALF_Y], shapes[k, TOP]
-            far = reach + math.sqrt(half_x * half_x + half_y * half_y)
-            if dx * dx + dy * dy > far * far:
-                continue
-            # The grid in the shape's own frame.
-            c, s = shapes[k, COS], shapes[k, SIN]
-            x0, y0 = c * dx + s * dy, c * dy - s * dx
-            cos_turn, sin_turn = c * cos_yaw + s * sin_yaw, c * sin_yaw - s * cos_yaw
-            if shapes[k, ROUND]:
-                square = half_x * half_x
-                for j in range(n_points):
-                    px = x0 + cos_turn * along[j] - sin_turn * across[j]
-                    py = y0 + sin_turn * along[j] + cos_turn * across[j]
-                    higher = top if px * px + py * py <= square else -math.inf
-                    heights[j] = higher if higher > heights[j] else heights[j]
-            else:
-                for j in range(n_points):
-                    px = x0 + cos_turn * along[j] - sin_turn * across[j]
-                    py = y0 + sin_turn * along[j] + cos_turn * across[j]
-                    higher = top if (abs(px) <= half_x) & (abs(py) <= half_y) else -math.inf
-                    heights[j] = higher if higher > heights[j] else heights[j]
-        level = z - standing_height
-        for j in range(n_points):
-            out[i, j] = max(-limit, min(limit, level - heights[j]))
 
 
 class Scandots(Sensor):
@@ -146,7 +98,7 @@ class Scandots(Sensor):
 
     def _scanned(self, scenes: SceneArrays, poses: np.ndarray) -> np.ndarray:
         readings = np.empty((len(poses), len(self.points)), dtype=np.float32)
-        _scan(*scenes, poses, self._rows, self._reach, self.standing_height, self.limit, readings)
+        look_down(*scenes, poses, self._rows, self._reach, self.standing_height, self.limit, readings)
         return readings
 
 

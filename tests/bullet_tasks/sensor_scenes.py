@@ -31,7 +31,7 @@ def task_scenes(env_id, n):
     scenes = []
     for seed in range(n):
         env.reset(seed=seed)
-        scenes.append(env.unwrapped.scene)
+        scenes.append(env.unwrapped.world.scene)
     env.close()
     return scenes
 
