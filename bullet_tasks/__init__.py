@@ -3,11 +3,17 @@
 import gymnasium
 
 from bullet_tasks.tasks.lateral_choice import LateralChoice
+from bullet_tasks.tasks.midpoint_choice import MidpointChoice
 from bullet_tasks.tasks.signpost_nav import SignpostNav
 from bullet_tasks.tasks.square_maze import SquareMaze
 
 # Environment id -> task class. The task module's ``make_env`` builds the environment.
-_TASKS = {"LateralChoice-v0": LateralChoice, "SquareMaze-v0": SquareMaze, "SignpostNav-v0": SignpostNav}
+_TASKS = {
+    "LateralChoice-v0": LateralChoice,
+    "SquareMaze-v0": SquareMaze,
+    "SignpostNav-v0": SignpostNav,
+    "MidpointChoice-v0": MidpointChoice,
+}
 
 ENV_IDS = tuple(_TASKS)
 

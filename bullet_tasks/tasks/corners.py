@@ -9,8 +9,8 @@ PRIVILEGED_SIZE = 0.25
 """A corner is observed as the signs of its coordinates times this (the authors' release), so that knowing nothing is a
 standard deviation of 0.25."""
 
-# Signs of x and y.
-_CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+"""Signs of x and y."""
 
 
 class CornerTask(NavigationTask):
@@ -52,11 +52,11 @@ class CornerTask(NavigationTask):
         :param rng: source of all randomness
         :return: signs of the goal's x and y
         """
-        chosen = int(rng.integers(len(_CORNERS)))
-        places = tuple((sign_x * self.corner[0], sign_y * self.corner[1]) for sign_x, sign_y in _CORNERS)
+        chosen = int(rng.integers(len(CORNERS)))
+        places = tuple((sign_x * self.corner[0], sign_y * self.corner[1]) for sign_x, sign_y in CORNERS)
         self.goal = places[chosen]
         self.dead_zones = places[:chosen] + places[chosen + 1 :]
-        return _CORNERS[chosen]
+        return CORNERS[chosen]
 
     def privileged(self) -> np.ndarray:
         """Signs of the goal's x and y, each times 0.25; float32 ``(2,)``."""

@@ -220,6 +220,69 @@ class SignReader:
         return towards(observation, self.estimate() if self.has_read else self.READING_PLACE)
 
 
+class ColumnReader:
+    """
+    Solve Midpoint Choice without privileged knowledge: walk a square past the corners until the heights of the columns are
+    known, then to the corner of the second tallest.
+
+    :param points: of the scandots, m, ``(n_points, 2)``
+    """
+
+    HALF_SQUARE = 0.75  # m
+    # Footprint of a column along its corner's diagonal and beside it, m.
+    ALONG, BESIDE = (1.65, 1.91), (0.425, 0.78)
+    LEAST_HEIGHT = 0.02  # m; columns lower than this are as good as none
+
+    def __init__(self, points: np.ndarray) -> None:
+        self.points = points
+        self.heights: dict[tuple[float, float], float] = {}
+        self.route: Route | None = None
+        self.choice: tuple[float, float] | None = None
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """
+        :param observation: ``common`` and ``target`` are read, nothing else
+        """
+        corners = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+        if self.route is None:
+            here = position(observation)
+            way = [(x * self.HALF_SQUARE, y * self.HALF_SQUARE) for x, y in corners]
+            first = min(range(4), key=lambda i: math.dist(here, way[i]))
+            self.route = Route((way[first:] + way[:first]) * 3)
+        scandots = scandots_in_world(observation, self.points)
+        for corner in corners:
+            along = scandots @ np.array(corner) / math.sqrt(2.0)
+            beside = np.abs(scandots @ np.array((-corner[1], corner[0]))) / math.sqrt(2.0)
+            on_column = (self.ALONG[0] < along) & (along < self.ALONG[1])
+            on_column &= (self.BESIDE[0] < beside) & (beside < self.BESIDE[1])
+            if on_column.any():
+                self.heights[corner] = max(float(-observation["target"][on_column].min()), self.heights.get(corner, 0.0))
+        ranking = sorted(self.heights, key=lambda corner: -self.heights[corner])
+        # One corner has no columns, so three that have some are all.
+        known = len(ranking) == 4 or (len(ranking) == 3 and self.heights[ranking[-1]] > self.LEAST_HEIGHT)
+        if self.choice is None and known:
+            self.choice = ranking[1]
+        if self.choice is None:
+            return self.route(observation)
+        return towards(observation, through_the_gap(observation, self.choice))
+
+
+def through_the_gap(observation: dict[str, np.ndarray], corner: tuple[float, float]) -> tuple[float, float]:
+    """
+    Where to walk to in Midpoint Choice to reach a corner between its columns, m.
+
+    :param observation: ``common`` is read, nothing else
+    :param corner: signs of its x and y
+    """
+    x, y = position(observation)
+    along, beside = (x * corner[0] + y * corner[1]) / math.sqrt(2.0), (y * corner[0] - x * corner[1]) / math.sqrt(2.0)
+    if abs(beside) > 0.3 and 0.6 < along < 1.65:
+        # Beside the way between the columns: back, to come from the middle.
+        return 0.0, 0.0
+    ahead = (along + 0.7) / math.sqrt(2.0)
+    return corner[0] * ahead, corner[1] * ahead
+
+
 def run_episode(env: gymnasium.Env, policy: Policy, seed: int | None = None) -> Episode:
     """
     Run one episode.
