@@ -86,6 +86,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise
         self._substeps = round(substeps)
         self._elapsed_substeps = 0
+        self._privileged = np.empty(0, dtype=np.float32)
         self._substeps_in_limit = task.time_limit / self.robot.substep_period
 
     def reset(
@@ -107,6 +108,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         scene = self.world.scene
         state = self.robot.reset(start.x, start.y, scene.ground_height(start.x, start.y), start.yaw)
         self.task.begin(state, scene)
+        self._privileged = self.task.privileged()
         for sensor in self.sensors:
             sensor.reset(scene, self.np_random)
         self._elapsed_substeps = 0
@@ -148,14 +150,16 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         array = np.asarray(action, dtype=np.float64)
         if array.shape != self._action_shape:
             raise ValueError(f"An action must have shape {self._action_shape}, got {array.shape}.")
-        values = array.tolist()
-        if not all(map(math.isfinite, values)):
-            raise ValueError(f"An action must be finite, got {values}.")
+        values: list[float] = array.tolist()
+        for value in values:
+            if not math.isfinite(value):
+                raise ValueError(f"An action must be finite, got {values}.")
         return [max(-1.0, min(1.0, value)) for value in values]
 
     def _observation(self) -> dict[str, np.ndarray]:
         state = self.robot.state
-        observation = {"common": self.task.common(state), "privileged": self.task.privileged()}
+        # What only training knows does not change within an episode.
+        observation = {"common": self.task.common(state), "privileged": self._privileged.copy()}
         if self.sensors:
             observation["target"] = self.sensors[0].read(state)
         return observation

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from bullet_tasks.infos import unpack
 from bullet_tasks.shared_arrays import SharedArrays
 from bullet_tasks.vec_worker import (
     ACTION,
@@ -263,7 +264,7 @@ class BulletVecEnv(VecEnv):
         infos: list[dict[str, Any]] = []
         for worker, part in enumerate(self._parts):
             part_infos, reset_infos = replies[worker]
-            infos.extend(part_infos)
+            infos.extend(unpack(part_infos))
             for i, reset_info in reset_infos.items():
                 self.reset_infos[part[0] + i] = reset_info
         return self._copied_observations(), self._arrays[REWARD].copy(), self._arrays[DONE].copy(), infos

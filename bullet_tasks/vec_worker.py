@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from bullet_tasks.infos import PackedInfos, pack
 from bullet_tasks.shared_arrays import Layout, SharedArrays
 
 ACTION, REWARD, DONE = "action", "reward", "done"
@@ -96,11 +97,11 @@ class EnvHost:
         for key, array in self._observations:
             array[index] = observation if key is None else observation[key]
 
-    def step(self) -> tuple[list[dict[str, Any]], dict[int, dict[str, Any]]]:
+    def step(self) -> tuple[PackedInfos, dict[int, dict[str, Any]]]:
         """
         Step every environment with its shared action; one that ends is reset at once.
 
-        :return: info of every environment, and reset info by local index of those that ended
+        :return: infos of all environments, and reset info by local index of those that ended
         """
         infos, reset_infos = [], {}
         for i, env in enumerate(self._envs):
@@ -114,7 +115,7 @@ class EnvHost:
             self._dones[i] = done
             self._store(i, observation)
             infos.append(info)
-        return infos, reset_infos
+        return pack(infos), reset_infos
 
     def reset(self, seeds: Sequence[int | None], options: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """

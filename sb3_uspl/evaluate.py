@@ -68,7 +68,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--exp-id", type=int, default=0, help="experiment number; default: the latest")
     parser.add_argument("--load-best", action="store_true", help="best model of the training's evaluations")
     parser.add_argument("--policy", choices=("deployment", "privileged", "both"), default="both")
-    parser.add_argument("--physics", choices=("kinematic", "compiled", "full"), help="fidelity of the robot; default: the environment's")
+    parser.add_argument(
+        "--physics", choices=("kinematic", "compiled", "full"), help="fidelity of the robot; default: the environment's"
+    )
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
     parser.add_argument("--n-envs", type=int, default=32, help="environments that run at the same time")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")

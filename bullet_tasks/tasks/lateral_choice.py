@@ -115,9 +115,9 @@ class LateralChoice(NavigationTask):
 
     Differences from the paper and its release
         Decisions every 0.25 s instead of 20 ms, and turns of pi/4 instead of pi, which at 2 rad/s is all that a decision can
-        turn. No legs in ``physics="kinematic"``, hence none of the small locomotion
-        rewards, no falls by tipping over, and a flat floor without the +-2 cm roughness. The goal counts at once, not
-        after three control steps. The goal is one privileged number (x), as its y is always 0.
+        turn. No legs in ``physics="kinematic"`` and ``"compiled"``, hence none of the small locomotion rewards, no falls by
+        tipping over, and a flat floor without the +-2 cm roughness. The goal counts at once, not after three control steps.
+        The goal is one privileged number (x), as its y is always 0.
 
     Source
         Uncertainty-Sensitive Privileged Learning, task Lateral Choice; geometry and rewards measured in the authors'

@@ -1,7 +1,9 @@
 """Laws of shapes and scenes."""
 
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 from bullet_tasks.scene import SceneSpec
@@ -39,6 +41,38 @@ def test_moving_a_shape_leaves_the_others_and_the_original():
     assert moved["low"] is LOW and scene["wall"] is WALL
     with pytest.raises(KeyError, match="no_such"):
         scene.moved({"no_such": ((0.0, 0.0, 0.0), 0.0)})
+
+
+def test_the_compiled_ground_is_that_of_the_shapes():
+    rng = np.random.default_rng(0)
+    shapes = [
+        Box(f"b{i}", tuple(rng.uniform(-2, 2, 3)), tuple(rng.uniform(0.1, 1, 3)), yaw=rng.uniform(-4, 4), floor=i % 3 > 0)
+        for i in range(12)
+    ] + [Cylinder(f"c{i}", tuple(rng.uniform(-2, 2, 3)), *rng.uniform(0.1, 1, 2), floor=i % 3 > 0) for i in range(6)]
+    scene = SceneSpec(tuple(shapes), lower_ground=-3.0)
+    placements = {name: (tuple(rng.uniform(-2, 2, 3)), rng.uniform(-4, 4)) for name in ("b1", "b2", "b3", "c4", "c5")}
+    heights = set()
+    for present in (scene, scene.moved(placements), scene.moved(placements).moved({"b1": ((0.0, 0.0, 9.0), 1.0)})):
+        for x, y in rng.uniform(-2.5, 2.5, (500, 2)):
+            tops = [shape.top for shape in present.shapes if shape.floor and shape.covers(x, y)]
+            assert present.ground_height(x, y) == max([-3.0, *tops])
+            heights.add(max([-3.0, *tops]))
+    assert len(heights) > 12, "many floors were met"
+
+
+def test_a_moved_scene_is_one_made_of_moved_shapes():
+    moved = SceneSpec((LOW, WALL, DISC), -1.0).moved({"wall": ((3.0, 0.0, 1.0), 0.5), "disc": ((0.0, 1.0, 2.0), 0.0)})
+    wall = dataclasses.replace(WALL, centre=(3.0, 0.0, 1.0), yaw=0.5)
+    made = SceneSpec((LOW, wall, dataclasses.replace(DISC, centre=(0.0, 1.0, 2.0))), -1.0)
+    assert moved == made and hash(moved) == hash(made)
+    assert moved.packed.tobytes() == made.packed.tobytes()
+    assert moved.moved({}) == moved
+
+
+@pytest.mark.parametrize("placement", [((math.nan, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), math.inf), ((0.0, 0.0), 0.0)])
+def test_impossible_placements_are_refused(placement):
+    with pytest.raises(ValueError):
+        SceneSpec((WALL,)).moved({"wall": placement})
 
 
 @pytest.mark.parametrize(

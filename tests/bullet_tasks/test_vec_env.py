@@ -156,9 +156,10 @@ def actions(env, value=1):
 
 
 @pytest.mark.parametrize("n_workers", [1, 2])
+@pytest.mark.parametrize("physics", ["kinematic", "compiled"])
 @pytest.mark.parametrize("env_id", ENV_IDS)
-def test_registered_environments_step_as_in_dummy_vec_env(env_id, n_workers):
-    assert_equivalent([functools.partial(gymnasium.make, env_id)] * N_ENVS, n_workers=n_workers)
+def test_registered_environments_step_as_in_dummy_vec_env(env_id, physics, n_workers):
+    assert_equivalent([functools.partial(gymnasium.make, env_id, physics=physics)] * N_ENVS, n_workers=n_workers)
 
 
 @pytest.mark.parametrize("action_space", ACTION_SPACES, ids=lambda space: type(space).__name__)
