@@ -137,7 +137,8 @@ class SignpostNav(NavigationTask):
 
     Optimal behaviour
         Without the privileged observation: walk to the signpost, read its direction and its length off the scandots, walk to
-        the goal.
+        the goal. A simple script does so in 10 s on average and finds 99 % of the goals in time, and in 4 s
+        knowing the goal.
 
     Differences from the paper and its release
         Decisions every 0.25 s instead of 20 ms, and turns of pi/4 instead of pi, which at 2 rad/s is all that a decision can

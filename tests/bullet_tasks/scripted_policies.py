@@ -184,7 +184,7 @@ class SignReader:
     N_GOALS = 2500
     POST = np.array([4.65, 0.0])  # m
     HALF_THICKNESS = 0.15  # m
-    READING_PLACE = (3.0, 0.0)  # m; the longest signpost ends 0.45 m further
+    READING_PLACE = (3.2, 0.0)  # m; the longest signpost ends 0.25 m further
     IN_SIGHT = 1.4  # m from the signpost's centre, a little more than half of the longest
     TALLER = -0.25  # m; a reading below this is on the signpost
 
