@@ -1,12 +1,17 @@
-"""Scenes that sensors are compared in, and how far points are from the outlines of shapes."""
+"""Scenes and poses that sensors are compared in, and where edges are, about which two ways of seeing may differ."""
 
+import dataclasses
 import math
 
 import gymnasium
 import numpy as np
 
 from bullet_tasks.scene import SceneSpec
+from bullet_tasks.sensors import CameraPose, Intrinsics
+from bullet_tasks.sensors.compiled_depth import CompiledDepth
 from bullet_tasks.shapes import Box, Cylinder, Shape
+
+CLEARANCE = 0.05  # m; PyBullet's renderer looks through what is closer than 1 cm
 
 
 def random_scene(rng, n_boxes=12, n_cylinders=4, extent=3.0):
@@ -49,3 +54,39 @@ def distance_to_outline(shape, points):
     c, s = math.cos(shape.yaw), math.sin(shape.yaw)
     outside = np.abs(np.stack([c * dx + s * dy, c * dy - s * dx])) - np.array(shape.half_extents[:2])[:, None]
     return np.where((outside < 0).all(axis=0), -outside.max(axis=0), np.hypot(*np.maximum(outside, 0.0)))
+
+
+def clear_poses(scene, rng, n, extent=1.5):
+    """Poses of a camera around a scene's solid shapes, not within one nor with one right before the lens."""
+    eye = CompiledDepth(Intrinsics.from_field_of_view(40, 30, math.radians(110.0)), 1.0)
+    eye.reset(scene)
+    centres = [shape.centre[:2] for shape in scene.shapes if shape.solid]
+    poses = []
+    while len(poses) < n:
+        x, y = np.array(centres[rng.integers(len(centres))]) + rng.uniform(-extent, extent, 2)
+        pose = CameraPose(x, y, rng.uniform(0.1, 0.9), rng.uniform(-4.0, 4.0), rng.uniform(-0.3, 0.6))
+        if eye.render(pose).min() > CLEARANCE:
+            poses.append(pose)
+    return poses
+
+
+def depth_bounds(intrinsics, far, scene, pose, shift, cylinder_scale=1.0):
+    """
+    The least and the greatest depth that we cast if the pixels were moved by ``shift`` in all directions, m.
+
+    They are equal but for rounding on a face that is seen head-on, and far apart at the edge of a shape.
+
+    :param cylinder_scale: of the thinnest cylinders that count
+    """
+    shapes = [
+        dataclasses.replace(shape, radius=shape.radius * cylinder_scale) if isinstance(shape, Cylinder) else shape
+        for shape in scene.shapes
+    ]
+    depths = []
+    for seen in (scene, SceneSpec(tuple(shapes), scene.lower_ground)):
+        for dx, dy in ((0, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+            centre = {"centre_x": intrinsics.centre_x + shift * dx, "centre_y": intrinsics.centre_y + shift * dy}
+            caster = CompiledDepth(dataclasses.replace(intrinsics, **centre), far)
+            caster.reset(seen)
+            depths.append(caster.render(pose))
+    return np.min(depths, axis=0), np.max(depths, axis=0)
