@@ -114,10 +114,7 @@ class EpisodeReplayBuffer:
         :param obs: what :class:`~sb3_uspl.wrappers.UncertaintyVecWrapper` returns, ``(n_envs, ...)`` by key
         """
         step = obs[EPISODE_STEP]
-        for env in np.flatnonzero((step == 0) & (self.lengths > 0)):
-            arrays = {key: array[env, : self.lengths[env]].copy() for key, array in self.running.items()}
-            self.fresh.append(Episode(arrays, mismatched=bool(env >= self.n_envs - self.n_mismatched)))
-        self.lengths[step == 0] = 0
+        self.close_ended(step)
         # A callback that stops training skips a decision; what is left of such an episode has a gap and is not used.
         whole = step == self.lengths
         self.lengths[~whole] = 0
@@ -128,6 +125,17 @@ class EpisodeReplayBuffer:
         for key, array in self.running.items():
             array[rows, step[rows]] = obs[key][rows]
         self.lengths[rows] += 1
+
+    def close_ended(self, step: np.ndarray) -> None:
+        """
+        An environment at step 0 has ended the episode before.
+
+        :param step: of the current observation in its episode, ``(n_envs,)``
+        """
+        for env in np.flatnonzero((step == 0) & (self.lengths > 0)):
+            arrays = {key: array[env, : self.lengths[env]].copy() for key, array in self.running.items()}
+            self.fresh.append(Episode(arrays, mismatched=bool(env >= self.n_envs - self.n_mismatched)))
+        self.lengths[step == 0] = 0
 
     def end_iteration(self) -> None:
         """Move this iteration's episodes to the replay and drop the oldest ones beyond the budget."""

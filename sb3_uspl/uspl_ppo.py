@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
-from sb3_uspl.encoder import gaussian_nll
+from sb3_uspl.encoder import Belief, gaussian_nll
 from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
@@ -90,6 +90,9 @@ class USPLPPO(PPO):
     :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170)
     :param encoder_max_grad_norm: gradient clipping of the encoder
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
+    :param encoder_bf16: whether the encoder's update computes in bfloat16 where torch's autocast deems it safe; for GPUs
+    :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; worth its minute of compilation for
+        the "paper" preset on a GPU
     :param context_length: longest episode, in decisions
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
@@ -157,6 +160,8 @@ class USPLPPO(PPO):
         encoder_updates: int = 16,
         encoder_max_grad_norm: float = 1.0,
         encoder_warmup: bool = True,
+        encoder_bf16: bool = False,
+        encoder_compile: bool = False,
         context_length: int = 1024,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -212,6 +217,7 @@ class USPLPPO(PPO):
         self.encoder_weight_decay = encoder_weight_decay
         self.encoder_batch_size, self.encoder_updates = encoder_batch_size, encoder_updates
         self.encoder_max_grad_norm, self.encoder_warmup = encoder_max_grad_norm, encoder_warmup
+        self.encoder_bf16, self.encoder_compile = encoder_bf16, encoder_compile
         self.context_length = context_length
         self._rollout_env: UncertaintyVecWrapper | None = None
         self._progress_period: tuple[int, int] | None = None
@@ -422,6 +428,8 @@ class USPLPPO(PPO):
             self.logger.record(f"uspl/{name}", float(np.mean(values)))
         wrapper.metrics.clear()
         self.logger.record("uspl/progress", wrapper.progress)
+        # An episode that ended with the rollout's last decision is over, though no observation has been added since.
+        episodes.close_ended(wrapper.step_count)
         if self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0):
             self._train_encoder(episodes)
             self.policy.encoder.eval()
@@ -438,12 +446,16 @@ class USPLPPO(PPO):
         update_learning_rate(optimizer, learning_rate)
         self.logger.record("encoder/learning_rate", learning_rate)
         encoder.train()
+        # A compiled function cannot be saved, but torch remembers what it has compiled: asking again is cheap.
+        forward = th.compile(encoder.__call__, dynamic=True) if self.encoder_compile else encoder
         metrics = []
         batches = episodes.batches(self.encoder_updates, self.encoder_batch_size, self.device)
         for update, (tokens, truth, lengths) in enumerate(batches):
             if update == 0:
                 encoder.features.update_normalizers(tokens)
-            belief, _ = encoder(tokens, lengths)
+            with th.autocast(self.device.type, th.bfloat16, enabled=self.encoder_bf16):
+                belief, _ = forward(tokens, lengths)
+            belief = Belief(belief.mean.float(), belief.log_std.float())
             loss = gaussian_nll(belief, truth)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()

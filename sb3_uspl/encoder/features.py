@@ -171,7 +171,7 @@ class TokenFeatures(nn.Module):
         if self.has_image:
             images = tokens[TARGET]
             batch = images.shape[:-3]
-            parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, -1))
+            parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, DepthCNN.WIDTH))
         return self.trunk(th.cat(parts, dim=-1))
 
     @staticmethod

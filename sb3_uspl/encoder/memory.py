@@ -109,6 +109,8 @@ class GRUMemory(Memory):
     def initial_state(self, n_envs: int) -> MemoryState:
         return (th.zeros(n_envs, self.width, device=next(self.parameters()).device),)
 
+    # A compiler would unroll the loop over time, anew for every length; cuDNN's recurrence is beyond its reach anyway.
+    @th.compiler.disable  # type: ignore[untyped-decorator]
     def _remember(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
         outputs = self._on_gpu(features, lengths) if features.is_cuda else self._on_cpu(features, lengths)
         # The output of a one-layer GRU is its state; an empty sequence leaves the initial state.

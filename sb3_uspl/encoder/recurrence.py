@@ -16,6 +16,7 @@ class PackedGRU(th.autograd.Function):
     """
 
     @staticmethod
+    @th.amp.custom_fwd(device_type="cpu", cast_inputs=th.float32)
     def forward(  # type: ignore[override]
         ctx: Any, gates: th.Tensor, weight: th.Tensor, bias: th.Tensor, batch_sizes: list[int]
     ) -> th.Tensor:
@@ -52,6 +53,7 @@ class PackedGRU(th.autograd.Function):
         return hidden
 
     @staticmethod
+    @th.amp.custom_bwd(device_type="cpu")
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor, None]:  # type: ignore[override]
         """
         :param ctx: autograd's

@@ -316,6 +316,23 @@ def test_training_goes_on_after_a_callback_stopped_it():
     model.learn(512, reset_num_timesteps=False)
 
 
+@pytest.mark.parametrize("length", [5, 8])
+def test_after_an_update_every_memory_holds_its_own_episode_and_nothing_else(length):
+    """Episodes of 8 decisions end with the rollout of 16: their successors must start with an empty memory."""
+    model = make_model(env_kwargs=dict(length=length))
+    model.learn(8 * 16 * 2)
+    wrapper, episodes = model._rollout_env, model.rollout_buffer.episodes
+    np.testing.assert_array_equal(episodes.lengths, wrapper.step_count)
+    assert wrapper.step_count[0] == 32 % length
+    encoder = model.policy.encoder
+    with th.no_grad():
+        memory = encoder.memory.initial_state(8)
+        for t in range(32 % length):
+            _, memory = encoder.step({key: th.as_tensor(episodes.running[key][:, t]) for key in wrapper._tokens}, memory)
+        _, memory = encoder.step(wrapper._tokens, memory)
+    th.testing.assert_close(wrapper.memory, memory, atol=1e-5, rtol=1e-4)
+
+
 def test_success_of_the_privileged_policy_leaves_out_mismatched_environments():
     model = make_model(mismatch_fraction=0.25)
     model._setup_learn(100)
