@@ -1,7 +1,7 @@
 """Uncertainty-Sensitive Privileged Learning for Stable-Baselines3: robots that gather information before they act."""
 
 from sb3_uspl import envs as envs  # registers the environments
-from sb3_uspl.baselines import RMA
+from sb3_uspl.baselines import RMA, RESeLPolicy, RESeLPPO
 from sb3_uspl.observations import PrivilegedObservation
 from sb3_uspl.policies import CnnPolicy, DeploymentState, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.uspl_ppo import USPLPPO
@@ -16,5 +16,7 @@ __all__ = [
     "MlpPolicy",
     "MultiInputPolicy",
     "PrivilegedObservation",
+    "RESeLPPO",
+    "RESeLPolicy",
     "USPLPolicy",
 ]

@@ -17,12 +17,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import bullet_tasks as bullet_tasks  # registers the environments
 from bullet_tasks.vec_env import BulletVecEnv
-from sb3_uspl import RMA, USPLPPO
+from sb3_uspl import RMA, USPLPPO, RESeLPPO
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "zoo_configs"
 TRAINED_AGENTS = ROOT / "trained_agents"
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"uspl_ppo": USPLPPO, "rma": RMA}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"uspl_ppo": USPLPPO, "rma": RMA, "resel_ppo": RESeLPPO}
 
 EVALUATION_OFFSET = 500_000
 """The zoo seeds training and evaluation environments alike; ours are evaluated on other seeds than they are trained on."""
@@ -65,7 +65,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
 
 def register() -> None:
-    """Make ``--algo uspl_ppo``, ``--algo rma`` and our environments known to the zoo's commands."""
+    """Make our algorithms (``--algo uspl_ppo``, ``rma``, ``resel_ppo``) and environments known to the zoo's commands."""
     rl_zoo3.ALGOS.update(ALGORITHMS)
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
 
