@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bullet_tasks.robots.base import Robot
+from bullet_tasks.scene import SceneSpec
 from bullet_tasks.sensors import Sensor
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Outcome, Task
@@ -89,6 +90,11 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self._privileged = np.empty(0, dtype=np.float32)
         self._substeps_in_limit = task.time_limit / self.robot.substep_period
 
+    @property
+    def scene(self) -> SceneSpec:
+        """The scene of the present episode."""
+        return self.world.scene
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -105,7 +111,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise ValueError(f"Unknown reset options {sorted(options)}; this environment has none.")
         start = self.task.reset(self.np_random)
         self.world.place(start.placements)
-        scene = self.world.scene
+        scene = self.scene
         state = self.robot.reset(start.x, start.y, scene.ground_height(start.x, start.y), start.yaw)
         self.task.begin(state, scene)
         self._privileged = self.task.privileged()

@@ -202,6 +202,7 @@ def test_a_sensor_yields_the_target_observation(env_id):
     assert env.observation_space.contains(observation)
     # The sensor sees the world of this episode: the goal's disc lies where the goal is.
     assert sensor.scene["goal"].centre[:2] == env.task.goal
+    assert env.scene is sensor.scene, "and so do films"
     observation, *_ = env.step(np.array([0.5], np.float32))
     assert observation["target"][0] == np.float32(env.robot.state.yaw)
     env.close()
