@@ -162,9 +162,11 @@ def evaluate(
     :param venv: environments
     :param n_episodes: number of episodes, of each policy
     :param seed: seed of the first episode
-    :param policy: "deployment", "privileged" or "both"
+    :param policy: "deployment", "privileged" or "both"; a model without a privileged policy is evaluated without it in "both"
     :return: numbers by name, ready for JSON; what was not measured is None
     """
+    if policy == "both" and not isinstance(model.policy, USPLPolicy):
+        policy = "deployment"
     runs = {
         name: run_episodes(model, venv, n_episodes, seed, name)
         for name in ("deployment", "privileged")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -94,3 +95,9 @@ def test_evaluate_names_what_it_measured(model):
 def test_unknown_policies_are_refused(model):
     with pytest.raises(ValueError, match="'deployment' or 'privileged'"):
         run_episodes(model, make_vec_env(ToyEnv, 1), 1, policy="oracle")
+
+
+def test_a_model_without_a_privileged_policy_is_evaluated_without_it():
+    venv = make_vec_env(ToyEnv, 2, seed=0)
+    result = evaluate(PPO("MultiInputPolicy", venv, n_steps=16, batch_size=32), venv, 3)
+    assert 0.0 <= result["success_rate"] <= 1.0 and result["privileged_success_rate"] is None
