@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint format type check clean
+.PHONY: demo test test-slow benchmark benchmark-learning lint format type check clean
 
 $(INSTALLED): setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v < (3, 12) else "Python %d.%d was found, but PyBullet 3.2.7 has wheels up to Python 3.11 only: install Python 3.10 or 3.11 and run `make PYTHON=python3.11 ...`" % v)'
@@ -22,6 +22,14 @@ test: $(INSTALLED) lint type
 
 test-slow: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
+
+# Up to 20 minutes on two cores that nobody else uses; prints tables and writes benchmarks/results.json.
+benchmark: $(INSTALLED)
+	$(BIN)/python -m benchmarks
+
+# Hours: trains until success, writes benchmarks/learning.json.
+benchmark-learning: $(INSTALLED)
+	$(BIN)/python -m benchmarks.to_success
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -1,0 +1,104 @@
+"""
+How fast it is: prints tables and writes JSON. ``make benchmark``; all cores should be free, else the numbers mean little.
+
+Every comparison is measured in one run, its contenders in turn, round after round: ratios are medians of the ratios within a
+round. ``targets`` holds the ratios against what the project wants to reach.
+"""
+
+import argparse
+import inspect
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks import encoder, environments, gpu, growth, training
+from benchmarks.harness import TARGETS, Row, Tables, show, write_json
+from benchmarks.machine import ROOT, busy, describe, load
+
+
+def sensors(repetitions: int = 5) -> Tables:
+    """
+    Sensors against PyBullet's own, see ``benchmarks.sensors``.
+
+    :param repetitions: rounds
+    """
+    try:
+        from benchmarks.sensors import run
+    except ImportError as error:
+        print(f"No benchmark of the sensors here: {error}")
+        return {}
+    return {"Sensors": run(repetitions=repetitions)}
+
+
+SECTIONS: dict[str, tuple[Callable[..., Tables], dict[str, Any]]] = {
+    "environments": (environments.run, environments.QUICK),
+    "sensors": (sensors, {"repetitions": 1}),
+    "encoder": (encoder.run, encoder.QUICK),
+    "training": (training.run, training.QUICK),
+    "growth": (growth.run, growth.QUICK),
+    "gpu": (gpu.run, gpu.QUICK),
+}
+"""Function and its sizes with ``--quick``."""
+
+
+def run_sections(names: list[str], quick: bool, overrides: dict[str, Any], path: Path, markdown: bool = False) -> bool:
+    """
+    Measure, print and keep; what has been measured is kept even if a later section fails.
+
+    :param names: of the sections
+    :param quick: with small sizes, once
+    :param overrides: arguments for those sections that know them; None is left out
+    :param path: JSON file to write
+    :param markdown: tables as Markdown
+    :return: whether no section failed
+    """
+    content: dict[str, Any] = {"machine": describe(), "quick": quick, "overrides": overrides, "sections": {}}
+    content["load_before"], targets, succeeded = load(), list[Row](), True
+    print(busy() or "The machine is quiet.", flush=True)
+    for name in names:
+        function, small = SECTIONS[name]
+        known = inspect.signature(function).parameters
+        arguments = {**(small if quick else {}), **{k: v for k, v in overrides.items() if k in known and v is not None}}
+        begin = time.perf_counter()
+        try:
+            tables = function(**arguments)
+        except Exception:
+            traceback.print_exc()
+            content["sections"][name], succeeded = {"failed": traceback.format_exc()}, False
+            continue
+        for title, table in tables.items():
+            targets += table if title == TARGETS else []
+            if title != TARGETS:
+                print("\n" + show(title, table, markdown), flush=True)
+        content["sections"][name] = {"seconds": time.perf_counter() - begin, "tables": tables}
+        content["load_after"] = load()
+        write_json(path, content)
+    if targets:
+        print("\n" + show("Targets", targets, markdown), flush=True)
+    print(f"\nLoad average before {content['load_before']}, after {load()}. Written to {path}.")
+    return succeeded
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sections", nargs="*", help=f"some of: {', '.join(SECTIONS)} (all by default)")
+    parser.add_argument("--quick", action="store_true", help="small sizes, once: whether it runs, not how fast")
+    parser.add_argument("--repetitions", type=int, help="rounds of every comparison (5)")
+    parser.add_argument("--threads", type=int, help="of torch (1), where they are not compared")
+    parser.add_argument("--json", type=Path, default=ROOT / "benchmarks" / "results.json", help="file to write")
+    parser.add_argument("--markdown", action="store_true", help="print tables as Markdown")
+    options = parser.parse_args()
+    unknown = sorted(set(options.sections) - set(SECTIONS))
+    if unknown:
+        parser.error(f"unknown sections {unknown}; known: {list(SECTIONS)}")
+    overrides = {"repetitions": options.repetitions, "threads": options.threads}
+    if not run_sections(options.sections or list(SECTIONS), options.quick, overrides, options.json, options.markdown):
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
