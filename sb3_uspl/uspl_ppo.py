@@ -81,6 +81,8 @@ class USPLPPO(PPO):
     :param decision_period: s per decision. None asks the environment's ``decision_period``, else assumes the paper's 20 ms.
     :param mismatch_fraction: share of environments that act on each other's privileged observation (release: 0.25). None: a
         quarter, or none (with a warning) if that is fewer than two environments.
+    :param mismatch_hold_time: least and greatest mean time in s after which a mismatched environment is shown another one's
+        privileged observation, spread over the environments. None: once a rollout (release).
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
     :param replay_bytes: memory budget of the episode replay
     :param encoder_learning_rate: of the encoder; constant, as in the release, unless a schedule is given (Tables 4 and 5: 5e-5
@@ -91,8 +93,8 @@ class USPLPPO(PPO):
     :param encoder_max_grad_norm: gradient clipping of the encoder
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
     :param encoder_bf16: whether the encoder's update computes in bfloat16 where torch's autocast deems it safe; for GPUs
-    :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; worth its minute of compilation for
-        the "paper" preset on a GPU
+    :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; takes minutes at the start, meant
+        for the "paper" preset on a GPU
     :param context_length: longest episode, in decisions
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
@@ -152,6 +154,7 @@ class USPLPPO(PPO):
         smoothing_time: float = 0.39,
         decision_period: float | None = None,
         mismatch_fraction: float | None = None,
+        mismatch_hold_time: tuple[float, float] | None = None,
         replay: str = "mismatched",
         replay_bytes: int = 256_000_000,
         encoder_learning_rate: float | Schedule = 1e-3,
@@ -212,6 +215,7 @@ class USPLPPO(PPO):
         self.discrete_privileged = {int(dim): list(values) for dim, values in (discrete_privileged or {}).items()}
         self.smoothing_time, self.decision_period = smoothing_time, decision_period
         self.mismatch_fraction = mismatch_fraction
+        self.mismatch_hold_time = mismatch_hold_time
         self.replay, self.replay_bytes = replay, replay_bytes
         self.encoder_learning_rate = encoder_learning_rate
         self.encoder_weight_decay = encoder_weight_decay
@@ -273,6 +277,7 @@ class USPLPPO(PPO):
             delta=self.delta,
             discrete_privileged=self.discrete_privileged,
             n_mismatched=self.n_mismatched,
+            mismatch_hold=self._mismatch_hold(),
         )
         self._rollout_env = None
 
@@ -340,6 +345,16 @@ class USPLPPO(PPO):
             f"use n_envs >= {needed}, a larger fraction, or mismatch_fraction=0."
         )
 
+    def _mismatch_hold(self) -> tuple[float, float] | None:
+        if self.mismatch_hold_time is None:
+            return None
+        low, high = (time / self.decision_period for time in self.mismatch_hold_time)  # type: ignore[operator]
+        if not 0.0 < low <= high:
+            raise ValueError(
+                f"mismatch_hold_time={self.mismatch_hold_time}: give the least and the greatest mean time in s, both positive."
+            )
+        return max(low, 1.0), max(high, 1.0)
+
     def _ask_decision_period(self) -> float:
         if self.decision_period is not None:
             return self.decision_period
@@ -402,7 +417,8 @@ class USPLPPO(PPO):
         wrapper = self._rollout_env
         assert wrapper is not None and env is self.env
         wrapper.progress = self.progress
-        wrapper.redraw_mismatch()
+        if self.mismatch_hold_time is None:
+            wrapper.redraw_mismatch()
         if self._action_std_schedule is not None:
             self.policy.set_action_std(self._action_std_schedule(self._current_progress_remaining))
         # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.

@@ -49,6 +49,7 @@ class UncertaintyConfig:
     delta: float = DELTA
     discrete_privileged: dict[int, list[float]] = field(default_factory=dict)
     n_mismatched: int = 0
+    mismatch_hold: tuple[float, float] | None = None
 
 
 class BlurNoise:
@@ -88,7 +89,9 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     Returned observations hold what the actor sees (``common``, blurred ``privileged``, ``uncertainty``, ``belief``), what only
     the critic sees (``truth``) and what the encoder learns from (``target``, ``previous_action``, ``episode_step``).
     ``terminal_observation`` is encoded with the memory from before the reset. Rewards are scaled with the uncertainty that the
-    action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations.
+    action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations; with
+    ``mismatch_hold``, each draws another one after a random time, whose mean is spread log-uniformly over that range, so that
+    the encoder sees the behaviour of the undecided and of those who change their mind before the policy has learned either.
 
     :param venv: environments under the observation contract
     :param encoder: observation encoder
@@ -108,6 +111,8 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self.metrics: dict[str, list[float]] = defaultdict(list)
         self._shape = (self.num_envs, space.shape[0])
         self._matched = np.arange(self.num_envs) < self.num_envs - config.n_mismatched
+        if config.mismatch_hold is not None:
+            self._redraw_rate = 1.0 / np.geomspace(*config.mismatch_hold, config.n_mismatched)
 
     def reset(self) -> VecEnvObs:
         return self.begin(self.venv.reset())  # type: ignore[arg-type]
@@ -133,6 +138,13 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         order = self.rng.permutation(np.flatnonzero(~self._matched))
         self._source = np.arange(self.num_envs)
         self._source[order] = np.roll(order, 1)
+
+    def _change_minds(self) -> None:
+        """Show some mismatched environments another one's privileged observation from now on; never their own."""
+        n = self.config.n_mismatched
+        due = np.flatnonzero(self.rng.uniform(size=n) < self._redraw_rate)
+        first = self.num_envs - n
+        self._source[first + due] = first + (due + self.rng.integers(1, n, len(due))) % n
 
     def step_async(self, actions: np.ndarray) -> None:
         self.previous_action = encode_actions(actions, self.action_space)
@@ -177,6 +189,8 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         mean = belief.mean.cpu().numpy()
         self.std = smooth(self.std, belief.std.cpu().numpy(), self.config.smoothing)
         self.noise.redraw(np.flatnonzero(self.step_count % self.config.noise_hold == 0))
+        if self.config.mismatch_hold is not None and self.config.n_mismatched:
+            self._change_minds()
         shown = self._blur(obs[PRIVILEGED][self._source], self.std, np.arange(self.num_envs))
         out = self._assemble(obs, shown, mean, self.std)
         out |= {PREVIOUS_ACTION: self.previous_action, EPISODE_STEP: self.step_count.copy()}

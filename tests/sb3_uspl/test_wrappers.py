@@ -132,6 +132,22 @@ def test_discrete_values_are_replaced_by_valid_ones_as_often_as_eq_4_says():
     assert changed == pytest.approx(obs["uncertainty"].mean() * 2 / 3, abs=0.04)  # a third draws the same value
 
 
+def test_mismatched_environments_change_their_minds_at_their_own_rates():
+    wrapper = make_wrapper(9, n_mismatched=4, mismatch_hold=(1.0, 64.0))
+    wrapper.reset()
+    changes, sources = np.zeros(9), []
+    for _ in range(2000):
+        before = wrapper._source
+        wrapper._source = before.copy()
+        wrapper.step(np.zeros((9, 1), np.float32))
+        changes += wrapper._source != before
+        sources.append(wrapper._source)
+    np.testing.assert_array_equal(np.array(sources)[:, :5], np.tile(np.arange(5), (2000, 1)))
+    assert np.min(sources, axis=0)[5:].min() >= 5 and (np.array(sources)[:, 5:] != np.arange(5, 9)).all()
+    # A third of the draws repeats the last one; rates 1, 1/4, 1/16, 1/64.
+    np.testing.assert_allclose(changes[5:] / 2000, 2 / 3 / np.array([1, 4, 16, 64]), rtol=0.35)
+
+
 def test_mismatched_environments_see_another_ones_truth_and_the_rest_their_own():
     wrapper = make_wrapper(8, n_mismatched=5, env_kwargs={"n_privileged": 16})
     obs = wrapper.reset()
