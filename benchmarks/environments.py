@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import multiprocessing
 import statistics
 import time
 from collections.abc import Sequence
@@ -99,6 +100,39 @@ def throughput(
         return interleave(contenders, repetitions)
 
 
+def count(n: int) -> int:
+    """
+    Work that needs nothing but a core.
+
+    :param n: how much
+    """
+    total = 0
+    for i in range(n):
+        total += i
+    return total
+
+
+def second_process(n: int = 2_000_000, repetitions: int = 5) -> dict[str, list[float]]:
+    """
+    What this machine gives to a second process: the limit for two workers. Cores that share a processor give less than 2.
+
+    :param n: additions of one process
+    :param repetitions: rounds
+    :return: million additions per second by number of processes
+    """
+    context = multiprocessing.get_context("fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn")
+    with contextlib.ExitStack() as stack:
+
+        def rate(pool: Any, n_processes: int) -> float:
+            begin = time.perf_counter()
+            pool.map(count, [n] * n_processes, 1)
+            return n_processes * n / (time.perf_counter() - begin) / 1e6
+
+        pools = {k: stack.enter_context(context.Pool(k)) for k in (1, 2)}
+        contenders = {f"{k} process(es)": functools.partial(rate, pool, k) for k, pool in pools.items()}
+        return interleave(contenders, repetitions)
+
+
 def reset_microseconds(env: gym.Env, n_resets: int) -> float:
     """
     Mean time of a reset.
@@ -183,7 +217,8 @@ def run(
     :param start_up_env: task whose start-up and memory are measured; None leaves that out
     :param n_start_up_envs: number of environments there
     """
-    table: list[Row] = []
+    values = second_process(repetitions=repetitions)
+    table = rows(values, "a loop in Python", "million additions / s", "1 process(es)")
     gains: dict[tuple[str, str, float], list[float]] = {}
     for env_id in env_ids:
         for variant, env_kwargs in variants(env_id).items():
