@@ -38,9 +38,15 @@ class ActiveTMazeEnv(gym.Env):
     ``TMazeClassicActive`` in their code, with their experiments' penalty. A decision lasts ``decision_period`` by our choice:
     the uncertainty, smoothed over 0.39 s, then falls by half a decision.
 
+    **Training on shorter corridors.** With ``shortest_corridor``, every episode draws its length L between that and
+    ``corridor_length`` with a probability of about 1 / L^2: corridors of 2-3, 4-7, 8-15, ... steps then get about as many
+    decisions each. What to do does not depend on the length, but only in a short corridor can an agent that still strays find
+    out what the oracle is worth.
+
     :param corridor_length: number of steps from the start to the junction (paper: 500)
+    :param shortest_corridor: see above; None: all corridors have ``corridor_length``
     :param render_mode: None or "rgb_array"
-    :raises ValueError: for a corridor without a step or an unknown ``render_mode``
+    :raises ValueError: for a corridor without a step, a shortest one that is longer, or an unknown ``render_mode``
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's convention)
@@ -58,18 +64,21 @@ class ActiveTMazeEnv(gym.Env):
     SMALLEST_CELL = 4
     """pixels"""
 
-    def __init__(self, corridor_length: int = 500, render_mode: str | None = None) -> None:
+    def __init__(
+        self, corridor_length: int = 500, shortest_corridor: int | None = None, render_mode: str | None = None
+    ) -> None:
         if not isinstance(corridor_length, int | np.integer) or corridor_length < 1:
             raise ValueError(
                 f"corridor_length={corridor_length!r}: give the number of steps to the junction, an integer >= 1."
             )
+        shortest = corridor_length if shortest_corridor is None else shortest_corridor
+        if not isinstance(shortest, int | np.integer) or not 1 <= shortest <= corridor_length:
+            raise ValueError(f"shortest_corridor={shortest_corridor!r}: give an integer from 1 to {corridor_length}, or None.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Unknown render_mode {render_mode!r}; known: None, 'rgb_array'.")
         self.render_mode = render_mode
-        self.corridor_length = int(corridor_length)
-        self.junction = self.ORACLE_LENGTH + self.corridor_length
-        self.episode_length = self.corridor_length + 2 * self.ORACLE_LENGTH + 1
-        self.penalty = -1.0 / self.corridor_length
+        self.longest, self.shortest = int(corridor_length), int(shortest)
+        self._build(self.longest)
         # Made once: an episode of 503 decisions should cost the learner's time, not the maze's.
         self._before_junction = np.zeros(2, np.float32)
         self._hints = {y: np.array([0.0, y], np.float32) for y in (-1, 1)}
@@ -85,6 +94,8 @@ class ActiveTMazeEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
         super().reset(seed=seed)
+        if self.shortest < self.longest:
+            self._build(int(1.0 / self.np_random.uniform(1.0 / (self.longest + 1), 1.0 / self.shortest)))
         self.x, self.y, self.time = self.ORACLE_LENGTH, 0, 0
         self.goal_y = 1 if self.np_random.random() < 0.5 else -1
         self.oracle_visited = False
@@ -135,6 +146,12 @@ class ActiveTMazeEnv(gym.Env):
         """
         scale = self.PRIVILEGED_SCALE
         return np.array([self.junction, mean[0] / scale]), np.array([0.0, std[0] / scale])
+
+    def _build(self, corridor_length: int) -> None:
+        self.corridor_length = min(max(corridor_length, self.shortest), self.longest)  # against rounding at the ends
+        self.junction = self.ORACLE_LENGTH + self.corridor_length
+        self.episode_length = self.corridor_length + 2 * self.ORACLE_LENGTH + 1
+        self.penalty = -1.0 / self.corridor_length
 
     def _observe(self) -> dict[str, np.ndarray]:
         if self.x == self.junction:

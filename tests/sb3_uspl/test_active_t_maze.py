@@ -149,6 +149,39 @@ def test_vector_envs_take_the_horizon_for_an_end_not_for_an_interruption():
     np.testing.assert_array_equal(obs["common"], np.zeros((2, 2)))
 
 
+def test_corridors_are_drawn_between_the_shortest_and_the_longest():
+    env = ActiveTMazeEnv(corridor_length=500, shortest_corridor=2)
+    env.reset(seed=0)
+    lengths = np.array([(env.reset(), env.corridor_length)[1] for _ in range(20_000)])
+    assert lengths.min() == 2 and 400 < lengths.max() <= 500
+    # P(2) = (1/2 - 1/3) / (1/2 - 1/501); a half-open octave from a gets 1 / (2 a) / (1/2 - 1/501).
+    np.testing.assert_allclose((lengths == 2).mean(), 0.1667 / 0.4980, atol=0.011)  # 3 standard errors
+    for start in (2, 4, 8, 16):
+        share = ((lengths >= start) & (lengths < 2 * start)).mean()
+        assert share == pytest.approx(0.5 / start / 0.4980, abs=0.011)
+
+
+def test_each_drawn_corridor_is_a_whole_task_and_a_seed_fixes_it():
+    env = gym.make("ActiveTMaze-v0", corridor_length=30, shortest_corridor=1)
+    drawn = set()
+    for seed in range(60):
+        assert run_optimally(env, seed) == (True, 1.0)
+        length = env.unwrapped.corridor_length
+        drawn.add(length)
+        steps = run(env, [UP] * 100, seed)
+        assert env.unwrapped.corridor_length == length and len(steps) - 1 == length + 3
+        # x = 1 all the time: behind the table from t = 3 on, up to the last decision but one.
+        assert sum(step[1] for step in steps) == pytest.approx(-1.0)
+    assert len(drawn) > 5
+
+
+def test_equal_bounds_draw_nothing():
+    fixed, drawn = ActiveTMazeEnv(corridor_length=7), ActiveTMazeEnv(corridor_length=7, shortest_corridor=7)
+    for seed in range(10):
+        assert fixed.reset(seed=seed)[0]["privileged"] == drawn.reset(seed=seed)[0]["privileged"]
+        assert drawn.corridor_length == 7
+
+
 def test_changing_an_observation_changes_nothing_in_the_maze():
     env, twin = ActiveTMazeEnv(corridor_length=2), ActiveTMazeEnv(corridor_length=2)
     walk = [LEFT, RIGHT, RIGHT, RIGHT, UP]
@@ -183,6 +216,12 @@ def test_a_belief_lies_on_the_map():
 def test_an_impossible_corridor_is_refused(corridor_length):
     with pytest.raises(ValueError, match="integer >= 1"):
         ActiveTMazeEnv(corridor_length=corridor_length)
+
+
+@pytest.mark.parametrize("shortest_corridor", [0, 21, 2.5])
+def test_an_impossible_shortest_corridor_is_refused(shortest_corridor):
+    with pytest.raises(ValueError, match="from 1 to 20"):
+        ActiveTMazeEnv(corridor_length=20, shortest_corridor=shortest_corridor)
 
 
 def test_unknown_render_mode_is_refused():
