@@ -218,7 +218,8 @@ def run(
     :param n_start_up_envs: number of environments there
     """
     values = second_process(repetitions=repetitions)
-    table = rows(values, "a loop in Python", "million additions / s", "1 process(es)")
+    second = rows(values, "a loop in Python", "million additions / s", "1 process(es)")
+    table: list[Row] = []
     gains: dict[tuple[str, str, float], list[float]] = {}
     for env_id in env_ids:
         for variant, env_kwargs in variants(env_id).items():
@@ -235,7 +236,11 @@ def run(
         for name, value in (("worst", min(measured)), ("median", statistics.median(measured))):
             what = f"{TWO} / {reference}, {variant}, {name} of {len(measured)} tasks"
             targets.append(target(what, value, at_least=limit))
-    tables = {"Environments, random actions": table, "Reset": resets(env_ids, n_resets, repetitions)}
+    tables = {
+        "A second process": second,
+        "Environments, random actions": table,
+        "Reset": resets(env_ids, n_resets, repetitions),
+    }
     if start_up_env is not None:
         title = f"Start-up and memory of {n_start_up_envs} environments"
         tables[title] = start_ups(start_up_env, n_start_up_envs, repetitions)

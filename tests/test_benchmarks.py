@@ -205,6 +205,7 @@ def test_synthetic_environment():
 
 def test_environments():
     tables = environments.run(1, n_envs=2, n_many=2, n_steps=4, n_resets=2, env_ids=["LateralChoice-v0"], start_up_env=None)
+    check_table(tables["A second process"], "million additions / s")
     speed = tables["Environments, random actions"]
     check_table(speed, "decisions / s")
     assert [row["contender"] for row in speed[:4]] == list(start_up.VEC_ENVS)
