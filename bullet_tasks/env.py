@@ -70,6 +70,8 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
         self.action_space = task.action_space
         self._action_shape = task.action_space.shape
+        self._n_choices = task.action_space.nvec.tolist() if isinstance(task.action_space, spaces.MultiDiscrete) else None
+        self.discrete_privileged = task.discrete_privileged
 
         self.world = World(task.scene, gui=render_mode == "human")
         try:
@@ -125,8 +127,8 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """
         Hold an action for one decision period, or until the episode ends.
 
-        :param action: numbers in the action space; those beyond its bounds are clipped
-        :raises ValueError: if the action has another shape or is not finite
+        :param action: numbers in the action space; those beyond the bounds of a Box are clipped
+        :raises ValueError: if the action has another shape, is not finite or names a choice that there is not
         """
         self._check_open()
         task, robot = self.task, self.robot
@@ -152,7 +154,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise RuntimeError("This environment is closed; make a new one.")
 
     def _checked(self, action: np.ndarray) -> list[float]:
-        """The action as floats within [-1, 1]."""
+        """The action as floats: within [-1, 1], or each one of the choices."""
         array = np.asarray(action, dtype=np.float64)
         if array.shape != self._action_shape:
             raise ValueError(f"An action must have shape {self._action_shape}, got {array.shape}.")
@@ -160,6 +162,11 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         for value in values:
             if not math.isfinite(value):
                 raise ValueError(f"An action must be finite, got {values}.")
+        if self._n_choices is not None:
+            for value, n in zip(values, self._n_choices, strict=True):
+                if not (value.is_integer() and 0.0 <= value < n):
+                    raise ValueError(f"An action must be whole numbers from 0 and below {self._n_choices}, got {values}.")
+            return values
         return [max(-1.0, min(1.0, value)) for value in values]
 
     def _observation(self) -> dict[str, np.ndarray]:

@@ -35,11 +35,13 @@ class Task(ABC):
     """Time that one action holds, s."""
     time_limit: float
     """Length of an episode that nothing ends, s."""
-    action_space: spaces.Box
+    action_space: spaces.Box | spaces.MultiDiscrete
     common_space: spaces.Box
     """What the deployed robot always knows, ``(n_common,)``."""
     privileged_space: spaces.Box
     """What only training knows, ``(n_privileged,)``."""
+    discrete_privileged: Mapping[int, Sequence[float]] = {}
+    """The privileged dimensions that are discrete, and their values."""
     camera: ClassVar[Camera]
     """Shows the whole scene."""
     judge: Judge
