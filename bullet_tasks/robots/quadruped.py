@@ -1,5 +1,8 @@
 """The Unitree A1 as seen by a high-level policy that commands its speed, heading and body pitch."""
 
+import functools
+from collections.abc import Callable
+
 from bullet_tasks.robots.base import Robot
 from bullet_tasks.robots.compiled_quadruped import CompiledQuadruped
 from bullet_tasks.robots.kinematic_quadruped import KinematicQuadruped
@@ -11,6 +14,7 @@ from bullet_tasks.robots.quadruped_body import (
     WALKING_SPEED,
     QuadrupedCommand,
 )
+from bullet_tasks.robots.walking_quadruped import ACCURATE, FAST, WalkingQuadruped
 from bullet_tasks.world import World
 
 __all__ = [
@@ -22,15 +26,17 @@ __all__ = [
     "CompiledQuadruped",
     "KinematicQuadruped",
     "QuadrupedCommand",
+    "WalkingQuadruped",
     "check_physics",
     "make_quadruped",
 ]
 
-_PHYSICS: dict[str, type[KinematicQuadruped] | type[CompiledQuadruped]] = {
+_PHYSICS: dict[str, Callable[[World], Robot[QuadrupedCommand]]] = {
     "kinematic": KinematicQuadruped,
     "compiled": CompiledQuadruped,
+    "full": functools.partial(WalkingQuadruped, preset=FAST),
+    "full_accurate": functools.partial(WalkingQuadruped, preset=ACCURATE),
 }
-_PLANNED_PHYSICS = ("full",)
 
 
 def make_quadruped(world: World, physics: str = "kinematic") -> Robot[QuadrupedCommand]:
@@ -39,8 +45,9 @@ def make_quadruped(world: World, physics: str = "kinematic") -> Robot[QuadrupedC
 
     :param world: where
     :param physics: ``"kinematic"``: the body follows the command, collisions are PyBullet's; ``"compiled"``: the same model,
-        several times faster, without PyBullet
-    :raises ValueError: if the physics is unknown or not available yet
+        several times faster, without PyBullet; ``"full"``: it walks on its legs, with gravity and contacts;
+        ``"full_accurate"``: the same with the A1 of ``pybullet_data`` and shorter steps, several times slower
+    :raises ValueError: if the physics is unknown
     """
     check_physics(physics)
     return _PHYSICS[physics](world)
@@ -51,9 +58,7 @@ def check_physics(physics: str) -> None:
     Reject an unknown kind of physics before anything is built.
 
     :param physics: its name
-    :raises ValueError: if it is unknown or not available yet
+    :raises ValueError: if it is unknown
     """
-    if physics in _PLANNED_PHYSICS:
-        raise ValueError(f"physics={physics!r} is not available yet for the quadruped; available: {sorted(_PHYSICS)}.")
     if physics not in _PHYSICS:
         raise ValueError(f"Unknown physics {physics!r} for the quadruped; available: {sorted(_PHYSICS)}.")
