@@ -1,0 +1,76 @@
+"""The quadrotor as a rigid body that follows its inner loop exactly: PyBullet says what it touches."""
+
+from bullet_tasks.robots import quadrotor_kernels as kernels
+from bullet_tasks.robots.quadrotor_body import (
+    HALF_EXTENTS,
+    MASS,
+    SUBSTEP,
+    Launch,
+    Quadrotor,
+    QuadrotorState,
+    looks,
+    orientation,
+    state_of,
+)
+from bullet_tasks.shapes import Box
+from bullet_tasks.world import World
+
+# PyBullet's distance is exact to rounding errors; that of the compiled quadrotor's ground is the same number.
+_TOUCH = 1e-4  # m
+_DISTANCE = 8  # index in a record of getClosestPoints (PyBullet Quickstart Guide)
+
+
+class KinematicQuadrotor(Quadrotor):
+    """
+    A rigid body without rotors: its flight follows the inner loop, the ground it lands on is PyBullet's.
+
+    :param world: the body is created in its simulation; what its floors carry it on
+    :param launch: where in the air a flight begins, asked at every reset
+    """
+
+    substep_period = SUBSTEP
+
+    def __init__(self, world: World, launch: Launch) -> None:
+        super().__init__(launch)
+        simulation = world.simulation
+        simulation.configure(SUBSTEP, gravity=0.0)
+        self._id = simulation.add_body(
+            self.name, Box("body", (0.0, 0.0, 0.0), HALF_EXTENTS), looks(), (0.0, 0.0, 1.0), mass=MASS
+        )
+        self._floors = [simulation.body_id(shape.name) for shape in world.scene.shapes if shape.floor]
+        self._set_pose = simulation.client.resetBasePositionAndOrientation
+        self._closest_points = simulation.client.getClosestPoints
+
+    def _show(self) -> QuadrotorState:
+        state = state_of(self._flight, self._floor)
+        self._set_pose(self._id, (state.x, state.y, state.z), orientation(state))
+        return state
+
+    def _touches(self) -> bool:
+        for floor in self._floors:
+            for point in self._closest_points(self._id, floor, _TOUCH):
+                if point[_DISTANCE] <= _TOUCH:
+                    return True
+        return False
+
+    def reset(self, x: float, y: float, ground: float, yaw: float) -> QuadrotorState:
+        """
+        Begin a flight above a place, at rest (see base class).
+
+        :param x: m
+        :param y: m
+        :param ground: height of the floor there, m
+        :param yaw: rad
+        """
+        super().reset(x, y, ground, yaw)
+        self.state = self._show()
+        return self.state
+
+    def substep(self) -> QuadrotorState:
+        """Let 1/50 s pass (see base class)."""
+        kernels.fly(self._flight, self._command, self._body)
+        self.state = self._show()
+        touching = self._touches()
+        kernels.ground(self._flight, self._body, touching)
+        self.state = self._show() if touching else state_of(self._flight, self._floor)
+        return self.state
