@@ -1,7 +1,7 @@
 """Uncertainty-Sensitive Privileged Learning for Stable-Baselines3: robots that gather information before they act."""
 
 from sb3_uspl import envs as envs  # registers the environments
-from sb3_uspl.baselines import RMA, RESeLPolicy, RESeLPPO
+from sb3_uspl.baselines import RMA, PrivRecons, RESeLPolicy, RESeLPPO, RewReg
 from sb3_uspl.observations import PrivilegedObservation
 from sb3_uspl.policies import CnnPolicy, DeploymentState, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.uspl_ppo import USPLPPO
@@ -15,8 +15,10 @@ __all__ = [
     "DeploymentState",
     "MlpPolicy",
     "MultiInputPolicy",
+    "PrivRecons",
     "PrivilegedObservation",
     "RESeLPPO",
     "RESeLPolicy",
+    "RewReg",
     "USPLPolicy",
 ]

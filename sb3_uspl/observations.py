@@ -182,3 +182,24 @@ class PrivilegedObservation(gym.ObservationWrapper):
             ends = np.stack([(low - self._offset) * self._scale, (high - self._offset) * self._scale])
             low, high = ends.min(axis=0), ends.max(axis=0)
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+class HidePrivileged(gym.ObservationWrapper):
+    """
+    Leaves out the privileged observation, so that SB3's and sb3-contrib's own algorithms see what is there at deployment.
+
+    :param env: environment under the observation contract
+    :raises ValueError: for a space outside the contract
+    """
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        space = check_observation_space(env.observation_space)
+        self.observation_space = spaces.Dict({key: part for key, part in space.spaces.items() if key != PRIVILEGED})
+
+    def observation(self, observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        :param observation: under the contract
+        :return: the same without ``privileged``
+        """
+        return {key: part for key, part in observation.items() if key != PRIVILEGED}
