@@ -1,8 +1,18 @@
 """Our algorithms and environments in RL Baselines3 Zoo. For the command lines only: importing the zoo patches Gymnasium."""
 
+import difflib
+import functools
+import importlib
+import itertools
 import os
 import sys
+import tempfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import yaml
 
 try:
     import rl_zoo3
@@ -17,12 +27,20 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import bullet_tasks as bullet_tasks  # registers the environments
 from bullet_tasks.vec_env import BulletVecEnv
-from sb3_uspl import RMA, USPLPPO, RESeLPPO
+from sb3_uspl import RMA, USPLPPO, PrivRecons, RESeLPPO, RewReg
+from sb3_uspl._configs import CONFIGS, load_entries
 
 ROOT = Path(__file__).resolve().parents[1]
-CONFIGS = ROOT / "zoo_configs"
 TRAINED_AGENTS = ROOT / "trained_agents"
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"uspl_ppo": USPLPPO, "rma": RMA, "resel_ppo": RESeLPPO}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "uspl_ppo": USPLPPO,
+    "rma": RMA,
+    "rewreg": RewReg,
+    "privrecons": PrivRecons,
+    "resel_ppo": RESeLPPO,
+}
+
+_PACKAGES = ("bullet_tasks", "sb3_uspl")
 
 EVALUATION_OFFSET = 500_000
 """The zoo seeds training and evaluation environments alike; ours are evaluated on other seeds than they are trained on."""
@@ -47,7 +65,11 @@ class ProgressCSV(BaseCallback):
 
 
 class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
-    """The zoo's, with shared-memory workers, evaluation seeds of its own and metrics in ``progress.csv``."""
+    """
+    The zoo's, with shared-memory workers, evaluation seeds of its own, metrics in ``progress.csv`` and files that inherit.
+
+    A training that is continued (``-i``) goes on counting, and its schedules go on: ``-n`` says how many decisions more.
+    """
 
     default_vec_env_cls = BulletVecEnv
 
@@ -59,15 +81,84 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         finally:
             self.seed = seed
 
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        if not self.config.endswith((".yml", ".yaml")):
+            return super().read_hyperparameters()
+        print(f"Loading hyperparameters from: {self.config}")
+        given = self.config
+        with tempfile.NamedTemporaryFile("w", suffix=".yml") as file:
+            yaml.safe_dump(load_entries(Path(given)), file)
+            file.flush()
+            try:
+                self.config = file.name
+                return super().read_hyperparameters()
+            finally:
+                self.config = given
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        if not self.continue_training:
+            super().learn(model)
+            return
+        # From zero again, blurring and reward transformation would start over with a warm-up, on a policy that is past it.
+        learn = functools.partial(model.learn, reset_num_timesteps=False)
+        super().learn(SimpleNamespace(learn=learn, env=model.env, policy=model.policy))
+
     def create_callbacks(self) -> None:
         super().create_callbacks()
         self.callbacks.append(ProgressCSV(os.path.join(self.save_path, "progress.csv")))
 
 
 def register() -> None:
-    """Make our algorithms (``--algo uspl_ppo``, ``rma``, ``resel_ppo``) and environments known to the zoo's commands."""
+    """Make our algorithms (``--algo uspl_ppo``, ``rma``, ...) and environments known to the zoo's commands."""
     rl_zoo3.ALGOS.update(ALGORITHMS)
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
+
+
+def check_names(algo: str, env_id: str) -> None:
+    """
+    :param algo: zoo name of an algorithm
+    :param env_id: name of an environment
+    :raises ValueError: if either is unknown, with those that exist
+    """
+    if algo not in rl_zoo3.ALGOS:
+        stock = sorted(set(rl_zoo3.ALGOS) - set(ALGORITHMS))
+        raise ValueError(f"There is no algorithm '{algo}'. Ours: {sorted(ALGORITHMS)}; the zoo's: {stock}.")
+    if env_id not in gym.registry:
+        ours = sorted(name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(_PACKAGES))
+        close = difflib.get_close_matches(env_id, gym.registry, n=1)
+        raise ValueError(
+            f"There is no environment '{env_id}'{f' (did you mean {close[0]}?)' if close else ''}. Ours: {ours}. One of your "
+            "own is known after the module that registers it is imported: --gym-packages <module>, where the command has it."
+        )
+
+
+def _value_of(*names: str) -> str | None:
+    """What follows an option on the command line."""
+    argv = sys.argv
+    return next((argv[i + 1] for i in range(1, len(argv) - 1) if argv[i] in names), None)
+
+
+def check_command_line() -> None:
+    """End with a message, rather than with the zoo's traceback, if the environment on the command line is unknown."""
+    packages = itertools.takewhile(lambda name: not name.startswith("-"), _after("--gym-packages"))
+    for package in packages:
+        importlib.import_module(package)
+    env_id = _value_of("--env")
+    if env_id is not None:
+        try:
+            check_names("ppo", env_id)
+        except ValueError as error:
+            raise SystemExit(str(error)) from error
+
+
+def _after(name: str) -> list[str]:
+    return sys.argv[sys.argv.index(name) + 1 :] if name in sys.argv else []
+
+
+def use_default_folder() -> None:
+    """Add ``-f trained_agents`` to the command line unless it names a folder."""
+    if not {"-f", "--folder"} & set(sys.argv):
+        sys.argv += ["-f", str(TRAINED_AGENTS)]
 
 
 def use_default_config() -> None:

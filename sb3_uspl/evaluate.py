@@ -7,11 +7,14 @@ import os
 import sys
 from typing import Any
 
+import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, BulletVecEnv, register, rl_zoo3
+import sb3_uspl
+from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, BulletVecEnv, check_names, register, rl_zoo3
 from sb3_uspl.evaluation import EVALUATION_SEED, evaluate
 
 
@@ -23,6 +26,7 @@ def load_agent(
     best: bool = False,
     n_envs: int = 32,
     env_kwargs: dict[str, Any] | None = None,
+    path: str | None = None,
 ) -> tuple[BaseAlgorithm, VecEnv]:
     """
     Load an agent and its environments from the zoo's layout ``<folder>/<algo>/<env>_<exp_id>/``.
@@ -34,16 +38,17 @@ def load_agent(
     :param best: the best model of the training's evaluations instead of the last one
     :param n_envs: number of environments
     :param env_kwargs: passed to the environment
+    :param path: the model's .zip file, instead of folder and number; its configuration is looked for beside it
     :return: model and environments, normalised as in training
-    :raises ValueError: if there is no such agent, or the environment refuses its arguments
+    :raises ValueError: for an unknown algorithm or environment, if there is no such agent or it was made by other versions or
+        for other spaces, or if the environment refuses its arguments
     """
-    from rl_zoo3.utils import create_test_env, get_model_path, get_saved_hyperparams
+    from rl_zoo3.utils import create_test_env, get_saved_hyperparams
 
-    name = rl_zoo3.utils.EnvironmentName(env_id)
-    try:
-        _, model_path, log_path = get_model_path(exp_id, folder, algo, name, load_best=best)
-    except (AssertionError, ValueError) as error:
-        raise ValueError(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error
+    check_names(algo, env_id)
+    model_path = _find_model(algo, env_id, folder, exp_id, best) if path is None else path
+    log_path = os.path.dirname(model_path)
+    model = _load_model(algo, model_path)
     hyperparams, stats_path = get_saved_hyperparams(os.path.join(log_path, env_id), test_mode=True)
     venv = create_test_env(
         env_id,
@@ -55,7 +60,38 @@ def load_agent(
         env_kwargs=env_kwargs,
         vec_env_cls=BulletVecEnv,
     )
-    return rl_zoo3.ALGOS[algo].load(model_path, device="cpu"), venv
+    try:
+        check_for_correct_spaces(venv, model.observation_space, model.action_space)
+    except ValueError as error:
+        venv.close()
+        raise ValueError(
+            f"{model_path} was trained on other spaces than those of {env_id}: {error}. Choose the environment, and the "
+            "env_kwargs, that it was trained with."
+        ) from error
+    return model, venv
+
+
+def _find_model(algo: str, env_id: str, folder: str, exp_id: int, best: bool) -> str:
+    from rl_zoo3.utils import get_model_path
+
+    try:
+        return get_model_path(exp_id, folder, algo, rl_zoo3.utils.EnvironmentName(env_id), load_best=best)[1]
+    except (AssertionError, ValueError) as error:
+        raise ValueError(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error
+
+
+def _load_model(algo: str, path: str) -> BaseAlgorithm:
+    if not os.path.isfile(path):
+        raise ValueError(f"There is no model {path}; expected the .zip file that model.save() writes.")
+    try:
+        return rl_zoo3.ALGOS[algo].load(path, device="cpu")
+    # What is raised depends on where two versions differ.
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError, ImportError) as error:
+        raise ValueError(
+            f"{path} cannot be loaded as a model of {algo} ({type(error).__name__}: {error}). Was it saved by another "
+            f"algorithm, or by other versions than sb3_uspl {sb3_uspl.__version__} and Stable-Baselines3 "
+            f"{stable_baselines3.__version__}? Name its algorithm, install its versions, or train anew."
+        ) from error
 
 
 def parse_arguments() -> argparse.Namespace:
