@@ -5,6 +5,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 from scripted_policies import Blind, informed, misled
 
 from bullet_tasks import ENV_IDS
@@ -246,14 +247,17 @@ def test_episodes_go_the_same_way(envs, policy):
 
 
 def ending(env, seed):
-    """Start and end of an episode of a robot that turns at random, with a drift to one side."""
+    """Start and end of an episode of a robot that turns at random, with a drift to one side, or chooses at random."""
     rng = np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
     start = [observation[key].tobytes() for key in ("common", "privileged")]
     drift, decisions = rng.normal(0.0, 0.1), 0
     while True:
-        turn = np.clip(rng.normal(drift, 0.5, env.action_space.shape), -1.0, 1.0)
-        _, _, terminated, truncated, info = env.step(turn.astype(np.float32))
+        if isinstance(env.action_space, spaces.MultiDiscrete):
+            action = rng.integers(env.action_space.nvec)
+        else:
+            action = np.clip(rng.normal(drift, 0.5, env.action_space.shape), -1.0, 1.0).astype(np.float32)
+        _, _, terminated, truncated, info = env.step(action)
         decisions += 1
         if terminated or truncated:
             return start, (decisions, terminated, info["is_success"])
