@@ -2,6 +2,7 @@
 
 import gymnasium
 
+from bullet_tasks.tasks.blind_mass_stack import BlindMassStack
 from bullet_tasks.tasks.lateral_choice import LateralChoice
 from bullet_tasks.tasks.midpoint_choice import MidpointChoice
 from bullet_tasks.tasks.signpost_nav import SignpostNav
@@ -13,6 +14,7 @@ _TASKS = {
     "SquareMaze-v0": SquareMaze,
     "SignpostNav-v0": SignpostNav,
     "MidpointChoice-v0": MidpointChoice,
+    "BlindMassStack-v0": BlindMassStack,
 }
 
 ENV_IDS = tuple(_TASKS)
