@@ -177,6 +177,41 @@ def ground(flight: np.ndarray, body: np.ndarray, touching: bool) -> None:
         flight[Z] = max(flight[Z], reach_down(body, flight[ROLL], flight[PITCH]))
 
 
+@numba.njit(f"UniTuple(float64, 3)({_ARRAY}, {_ARRAY}, float64, float64, float64)", cache=True)
+def _torque(
+    flight: np.ndarray, rotors: np.ndarray, roll_acceleration: float, pitch_acceleration: float, yaw_acceleration: float
+) -> tuple[float, float, float]:
+    """
+    Torque about the body's axes that accelerates the angles, N m (3 numbers): Euler's equations.
+
+    :param flight: ``(N_FLIGHT,)``
+    :param rotors: ``(N_ROTORS,)``
+    :param roll_acceleration: rad/s^2
+    :param pitch_acceleration: rad/s^2
+    :param yaw_acceleration: rad/s^2
+    """
+    cr, sr, cp, sp = math.cos(flight[ROLL]), math.sin(flight[ROLL]), math.cos(flight[PITCH]), math.sin(flight[PITCH])
+    roll_rate, pitch_rate, yaw_rate = flight[ROLL_RATE], flight[PITCH_RATE], flight[YAW_RATE]
+    p = roll_rate - yaw_rate * sp
+    q = pitch_rate * cr + yaw_rate * sr * cp
+    r = yaw_rate * cr * cp - pitch_rate * sr
+    p_dot = roll_acceleration - yaw_acceleration * sp - yaw_rate * pitch_rate * cp
+    q_dot = (
+        pitch_acceleration * cr
+        - pitch_rate * roll_rate * sr
+        + yaw_acceleration * sr * cp
+        + yaw_rate * (roll_rate * cr * cp - pitch_rate * sr * sp)
+    )
+    r_dot = (
+        yaw_acceleration * cr * cp
+        - yaw_rate * (roll_rate * sr * cp + pitch_rate * cr * sp)
+        - pitch_acceleration * sr
+        - pitch_rate * roll_rate * cr
+    )
+    x, y, z = rotors[INERTIA_X], rotors[INERTIA_Y], rotors[INERTIA_Z]
+    return x * p_dot + (z - y) * q * r, y * q_dot + (x - z) * r * p, z * r_dot + (y - x) * p * q
+
+
 @numba.njit(f"UniTuple(float64, 6)({_ARRAY}, {_ARRAY}, {_ARRAY}, {_ARRAY}, {_ARRAY})", cache=True)
 def spin(
     flight: np.ndarray, command: np.ndarray, body: np.ndarray, rotors: np.ndarray, thrusts: np.ndarray
@@ -195,9 +230,13 @@ def spin(
     roll, pitch, yaw = flight[ROLL], flight[PITCH], flight[YAW]
     lift = vertical_acceleration(flight[Z] - body[HALF_Z], flight[VZ], command[TARGET_ALTITUDE], body)
     total = rotors[MASS] * (body[GRAVITY] + lift) / (math.cos(roll) * math.cos(pitch))
-    about_x = rotors[INERTIA_X] * (w * w * (command[TARGET_ROLL] - roll) - 2.0 * w * flight[ROLL_RATE])
-    about_y = rotors[INERTIA_Y] * (w * w * (command[TARGET_PITCH] - pitch) - 2.0 * w * flight[PITCH_RATE])
-    about_z = -rotors[INERTIA_Z] * rotors[YAW_DAMPING] * flight[YAW_RATE]
+    about_x, about_y, about_z = _torque(
+        flight,
+        rotors,
+        w * w * (command[TARGET_ROLL] - roll) - 2.0 * w * flight[ROLL_RATE],
+        w * w * (command[TARGET_PITCH] - pitch) - 2.0 * w * flight[PITCH_RATE],
+        -rotors[YAW_DAMPING] * flight[YAW_RATE],
+    )
     up, left, forward, turning = 0.0, 0.0, 0.0, 0.0
     for i in range(4):
         on_left = 1.0 if i % 2 == 0 else -1.0

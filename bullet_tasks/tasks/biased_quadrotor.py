@@ -39,7 +39,7 @@ _FLOOR_HALF_HEIGHT = 0.05  # m
 _LINE_DISTANCE, _N_LINES = 2.0, 6  # m; lines on either side of the middle one
 _POST_DISTANCE, _N_POSTS = 4.0, 3
 _HALF_WIDTH = 0.02  # m, of lines and posts
-_CAMERA_DISTANCE, _CAMERA_HEIGHT = 5.5, 2.2  # m
+_CAMERA_DISTANCE, _CAMERA_HEIGHT = 4.4, 1.9  # m
 
 
 @dataclass(frozen=True)
