@@ -2,6 +2,7 @@
 
 import gymnasium
 
+from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotor
 from bullet_tasks.tasks.blind_mass_stack import BlindMassStack
 from bullet_tasks.tasks.lateral_choice import LateralChoice
 from bullet_tasks.tasks.midpoint_choice import MidpointChoice
@@ -14,6 +15,7 @@ _TASKS = {
     "SquareMaze-v0": SquareMaze,
     "SignpostNav-v0": SignpostNav,
     "MidpointChoice-v0": MidpointChoice,
+    "BiasedQuadrotor-v0": BiasedQuadrotor,
     "BlindMassStack-v0": BlindMassStack,
 }
 
