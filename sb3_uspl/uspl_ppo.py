@@ -76,7 +76,8 @@ class USPLPPO(PPO):
     :param blur_gain: K of Eq. 3 (Table 11)
     :param blur_noise: distribution of epsilon_c in Eq. 3, "uniform" (bounded dimensions, clipped) or "gaussian"
     :param blur_hold_time: s for which the blur noise is held (release: 10 decisions of 20 ms)
-    :param discrete_privileged: discrete dimensions and their values, blurred by Eq. 4, e.g. ``{0: [0.0, 0.25, 0.5]}``
+    :param discrete_privileged: discrete dimensions and their values, blurred by Eq. 4, e.g. ``{0: [0.0, 0.25, 0.5]}``. None
+        asks the environment's ``discrete_privileged``, else there are none.
     :param smoothing_time: time constant of the uncertainty smoothing in s (release: 0.95 per 20 ms)
     :param decision_period: s per decision. None asks the environment's ``decision_period``, else assumes the paper's 20 ms.
     :param mismatch_fraction: share of environments that act on each other's privileged observation (release: 0.25). None: a
@@ -212,7 +213,7 @@ class USPLPPO(PPO):
         self.uncertainty_input, self.mean_input = uncertainty_input, mean_input and uncertainty_input
         self.c_min, self.c_max, self.delta = c_min, c_max, delta
         self.blur_gain, self.blur_noise, self.blur_hold_time = blur_gain, blur_noise, blur_hold_time
-        self.discrete_privileged = {int(dim): list(values) for dim, values in (discrete_privileged or {}).items()}
+        self.discrete_privileged = discrete_privileged
         self.smoothing_time, self.decision_period = smoothing_time, decision_period
         self.mismatch_fraction = mismatch_fraction
         self.mismatch_hold_time = mismatch_hold_time
@@ -231,6 +232,7 @@ class USPLPPO(PPO):
     # -- set-up ------------------------------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
+        self.discrete_privileged = self._ask_discrete_privileged()
         self._check_arguments()
         self.n_mismatched = self._count_mismatched()
         self.decision_period = self._ask_decision_period()
@@ -290,6 +292,7 @@ class USPLPPO(PPO):
             raise ValueError(f"USPLPPO needs a subclass of USPLRolloutBuffer; {self.rollout_buffer_class} was given.")
         if self.blur_noise not in ("uniform", "gaussian"):
             raise ValueError(f"blur_noise='{self.blur_noise}': choose 'uniform' or 'gaussian'.")
+        assert self.discrete_privileged is not None
         for dim, values in self.discrete_privileged.items():
             if not 0 <= dim < space.shape[0]:
                 raise ValueError(
@@ -354,6 +357,13 @@ class USPLPPO(PPO):
                 f"mismatch_hold_time={self.mismatch_hold_time}: give the least and the greatest mean time in s, both positive."
             )
         return max(low, 1.0), max(high, 1.0)
+
+    def _ask_discrete_privileged(self) -> dict[int, list[float]]:
+        given = self.discrete_privileged
+        # Asked for first, because a missing attribute ends a worker of SubprocVecEnv.
+        if given is None and self.env is not None and self.env.has_attr("discrete_privileged"):
+            given = self.env.get_attr("discrete_privileged", indices=[0])[0]
+        return {int(dim): [float(value) for value in values] for dim, values in (given or {}).items()}
 
     def _ask_decision_period(self) -> float:
         if self.decision_period is not None:
