@@ -1,0 +1,44 @@
+"""Hyperparameters in ``zoo_configs/``: the zoo's files, which may also inherit from one another."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+CONFIGS = Path(__file__).resolve().parents[1] / "zoo_configs"
+
+INHERIT, EVERY = "inherit", "every"
+
+
+def load_entries(path: Path) -> dict[str, dict[str, Any]]:
+    """
+    Read a zoo file, one entry an environment. Two more keys let algorithms share what should not differ between them::
+
+        inherit: uspl_ppo.yml    # the entries of that file, beside this one; what this file says goes over them
+        every: {blur: false}     # goes over every entry, inherited or not
+        LateralChoice-v0: {...}  # goes over that entry, after ``every``
+
+    :param path: YAML file
+    :return: hyperparameters by environment
+    :raises ValueError: for a file that does not exist or is no mapping of mappings, or that inherits from itself
+    """
+    return _load(path, ())
+
+
+def _load(path: Path, heirs: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
+    path = path.resolve()
+    if path in heirs:
+        raise ValueError(f"{path} inherits from itself, by way of {[heir.name for heir in heirs]}.")
+    if not path.is_file():
+        by = f", which {heirs[-1]} inherits from" if heirs else ""
+        raise ValueError(f"There is no file {path}{by}.")
+    given = yaml.safe_load(path.read_text()) or {}
+    if not isinstance(given, dict):
+        raise ValueError(f"{path} holds a {type(given).__name__}; expected a mapping of environments to hyperparameters.")
+    parent, every = given.pop(INHERIT, None), given.pop(EVERY, None) or {}
+    entries = _load(path.parent / parent, (*heirs, path)) if parent else {}
+    wrong = [name for name, entry in {EVERY: every, **given}.items() if not isinstance(entry, dict)]
+    if wrong:
+        raise ValueError(f"{path}: the entries {wrong} are no mappings of hyperparameters.")
+    own = {name: {**entries.get(name, {}), **every, **entry} for name, entry in given.items()}
+    return {name: {**entry, **every} for name, entry in entries.items()} | own

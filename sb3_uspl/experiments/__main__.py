@@ -1,0 +1,144 @@
+"""``python -m sb3_uspl.experiments``: train what is missing of a table or figure of the paper, measure it, and draw it."""
+
+import argparse
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_uspl.experiments.figures import Figures
+from sb3_uspl.experiments.plan import Budget, Cell, Experiment, Plan, variant_of
+from sb3_uspl.experiments.provenance import ROOT, commit
+from sb3_uspl.experiments.results import MODELS, Results, collect, write_csv
+from sb3_uspl.experiments.runner import Grid, Launch, launch, share_cores
+from sb3_uspl.experiments.tables import NOTES, markdown
+
+TABLE_KINDS = tuple(NOTES)
+_STOPPED = "\nStopped. Nothing is lost: give the same command again to continue, or add --no-train to see what there is."
+
+
+def parse_arguments(plan: Plan, arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """
+    :param plan: what can be asked for
+    :param arguments: command line; None: the process's
+    :return: parsed and checked
+    """
+    parser = argparse.ArgumentParser(prog="python -m sb3_uspl.experiments", description=__doc__)
+    parser.add_argument("experiments", nargs="+", choices=sorted(plan.experiments), metavar="experiment", help="table1, ...")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of the trainings")
+    parser.add_argument("--envs", nargs="+", help="instead of the experiment's own environments")
+    parser.add_argument(
+        "--only", nargs="+", choices=sorted(plan.variants), metavar="VARIANT", help="train these variants only"
+    )
+    parser.add_argument("--budget", choices=sorted(plan.budgets), default="cpu", help="how long to train and evaluate")
+    parser.add_argument("--jobs", type=int, default=2, help="cells at the same time")
+    parser.add_argument("--model", choices=MODELS, default="best", help="of the training's evaluations; the CSV has both")
+    parser.add_argument("--no-train", action="store_true", help="show what there is")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "results", help="tables, pictures and raw results")
+    parser.add_argument("--logs", type=Path, default=Path("logs") / "experiments", help="trainings and checkpoints")
+    given = parser.parse_args(arguments)
+    if given.jobs < 1 or min(given.seeds) < 0 or len(set(given.seeds)) < len(given.seeds):
+        parser.error("--jobs must be at least 1, and --seeds different numbers of at least 0.")
+    return given
+
+
+def main(arguments: Sequence[str] | None = None, start: Launch = launch) -> int:
+    """
+    :param arguments: command line; None: the process's
+    :param start: starts a child
+    :return: exit status: 1 if a cell failed
+    """
+    plan = Plan()
+    given = parse_arguments(plan, arguments)
+    budget = plan.budgets[given.budget]
+    known = _registered()
+    wrong = [env for env in given.envs or [] if env not in known]
+    if wrong:
+        raise SystemExit(f"There are no environments {wrong}; a prefix 'bullet_tasks' or 'sb3_uspl.envs' is not needed.")
+    os.environ.update(share_cores(given.jobs))
+    results = Results(given.output / budget.name / "raw")
+    experiments = [plan.experiments[name] for name in given.experiments]
+    grids = {e.name: _cells(plan, e, given, budget, known) for e in experiments}
+    failed: dict[str, str] = {}
+    if not given.no_train:
+        # A cell that two experiments share is one cell.
+        cells = {cell.name: cell for grid in grids.values() for cell in grid}
+        wanted = [cell for cell in cells.values() if given.only is None or cell.variant in given.only]
+        failed = Grid(wanted, given.logs / budget.name, results, given.jobs, start).run()
+    for experiment in experiments:
+        missing = [] if given.envs else [env for env in experiment.envs if env not in known]
+        _show(plan, experiment, grids[experiment.name], missing, results, given)
+    for name, reason in failed.items():
+        print(f"FAILED: {name}: {reason}")
+    return 1 if failed else 0
+
+
+def _registered() -> set[str]:
+    import gymnasium
+
+    import bullet_tasks  # noqa: F401 (registers the environments)
+    import sb3_uspl  # noqa: F401 (the same)
+
+    return set(gymnasium.registry)
+
+
+def _cells(plan: Plan, experiment: Experiment, given: argparse.Namespace, budget: Budget, known: set[str]) -> list[Cell]:
+    envs = given.envs or [env for env in experiment.envs if env in known]
+    return plan.cells(experiment, envs, given.seeds, budget)
+
+
+def _show(
+    plan: Plan, experiment: Experiment, cells: list[Cell], missing: list[str], results: Results, given: argparse.Namespace
+) -> None:
+    folder = given.output / given.budget
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / f"{experiment.name}.csv", plan, cells, results)
+    figures, picture = Figures(plan, results), folder / f"{experiment.name}.png"
+    if experiment.kind in TABLE_KINDS:
+        summaries = collect(experiment, cells, results, given.seeds, given.model)
+        body = [markdown(plan, experiment, summaries, missing), "", NOTES[experiment.kind]]
+        drawn = figures.bars(experiment, summaries, picture)
+    else:
+        drawn = figures.draw(experiment, cells, picture)
+        body = [f"No such task yet: {env}." for env in missing]
+    unrun = [cell for cell in cells if not results.has(cell)]
+    model = "with the highest reward in the training's own evaluations" if given.model == "best" else "at the training's end"
+    text = [
+        f"# {experiment.title}",
+        "",
+        f"Budget `{given.budget}`, seeds {', '.join(map(str, given.seeds))}, the model {model}; "
+        f"{len(cells) - len(unrun)} of {len(cells)} cells run. Every cell: [{experiment.name}.csv]({experiment.name}.csv).",
+        "",
+        *([f"![{experiment.title}]({picture.name})"] if drawn else ["Nothing to draw yet."]),
+        "",
+        *body,
+        "",
+        *([f"Not run: {', '.join(_in_words(plan, cell) for cell in unrun)}.", ""] if unrun else []),
+        f"Made with `{_command(experiment, given)}` at commit `{commit()}`; the cells' own commits are in the CSV.",
+    ]
+    page = folder / f"{experiment.name}.md"
+    page.write_text("\n".join(text) + "\n")
+    print(f"\n{page}\n" + ("\n".join(body) if body else f"{picture}" if drawn else "nothing to draw yet"))
+
+
+def _in_words(plan: Plan, cell: Cell) -> str:
+    return f"{plan.label(variant_of(cell.variant))} {cell.env} seed {cell.seed}"
+
+
+def _command(experiment: Experiment, given: argparse.Namespace) -> str:
+    parts = ["python", "-m", "sb3_uspl.experiments", experiment.name, "--budget", given.budget]
+    parts += ["--seeds", *map(str, given.seeds), "--model", given.model]
+    if given.envs:
+        parts += ["--envs", *given.envs]
+    return shlex.join(parts)
+
+
+if __name__ == "__main__":
+    # As after Ctrl-C: the children, which do not hear a terminal's signals, have to be ended.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        raise SystemExit(_STOPPED) from None
