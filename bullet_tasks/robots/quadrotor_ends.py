@@ -30,7 +30,7 @@ class HoverLimits:
     altitude_tolerance: float = 0.15
     level_tolerance: float = 0.05
     hold_time: float = 1.0
-    crash_speed: float = 0.9
+    crash_speed: float = 1.1
     crash_tilt: float = 0.35
     flip_tilt: float = 1.2
 

@@ -164,7 +164,7 @@ class BiasedQuadrotor(Task):
         For 1 s on end, within 0.15 m of the true altitude 1.5 m and within 0.05 rad of true level in roll and in pitch.
 
     Termination
-        Success; or a crash, which is a touchdown faster than 0.9 m/s or tilted by more than 0.35 rad. After 12 s the episode
+        Success; or a crash, which is a touchdown faster than 1.1 m/s or tilted by more than 0.35 rad. After 12 s the episode
         is truncated.
 
     Optimal behaviour
