@@ -29,9 +29,7 @@ def parse_arguments(plan: Plan, arguments: Sequence[str] | None = None) -> argpa
     parser.add_argument("experiments", nargs="+", choices=sorted(plan.experiments), metavar="experiment", help="table1, ...")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of the trainings")
     parser.add_argument("--envs", nargs="+", help="instead of the experiment's own environments")
-    parser.add_argument(
-        "--only", nargs="+", choices=sorted(plan.variants), metavar="VARIANT", help="train these variants only"
-    )
+    parser.add_argument("--only", nargs="+", choices=sorted(plan.variants), metavar="VARIANT", help="train only these")
     parser.add_argument("--budget", choices=sorted(plan.budgets), default="cpu", help="how long to train and evaluate")
     parser.add_argument("--jobs", type=int, default=2, help="cells at the same time")
     parser.add_argument("--model", choices=MODELS, default="best", help="of the training's evaluations; the CSV has both")
@@ -56,7 +54,8 @@ def main(arguments: Sequence[str] | None = None, start: Launch = launch) -> int:
     known = _registered()
     wrong = [env for env in given.envs or [] if env not in known]
     if wrong:
-        raise SystemExit(f"There are no environments {wrong}; a prefix 'bullet_tasks' or 'sb3_uspl.envs' is not needed.")
+        ours = sorted({env for experiment in plan.experiments.values() for env in experiment.envs} & known)
+        raise SystemExit(f"There are no environments {wrong}. Those of the experiments: {ours}.")
     os.environ.update(share_cores(given.jobs))
     results = Results(given.output / budget.name / "raw")
     experiments = [plan.experiments[name] for name in given.experiments]

@@ -79,7 +79,11 @@ class Figures:
             axis.set_xticks(range(len(experiment.columns)))
             axis.set_xticklabels([self.plan.label(c) for c in experiment.columns], rotation=60, ha="right", fontsize="x-small")
             axis.set_title(env, fontsize="small")
-            axis.set_ylabel("success (%), paper: black" if experiment.kind == "success" else "s an iteration")
+            axis.set(xlim=(-0.6, len(experiment.columns) - 0.4), ylim=(0.0, None))
+            if experiment.kind == "success":
+                axis.set(ylabel="success (%), paper: black", ylim=(0.0, 108.0))
+            else:
+                axis.set_ylabel("s an iteration")
         figure.savefig(path)
         return True
 
@@ -151,7 +155,7 @@ class Figures:
             above.set_title("success" if episode["success"] else "no success", fontsize="small")
             below.set_xlabel("time (s)")
         rows[0, 0].set_ylabel("the robot's position")
-        rows[1, 0].set_ylabel("belief: mean ± σ, truth dashed")
+        rows[1, 0].set_ylabel(r"belief: mean $\pm$ $\sigma$, truth dashed")
         rows[0, 0].legend(fontsize="x-small")
         figure.suptitle(f"{experiment.title}: seed {cell.seed}", fontsize="medium")
         figure.savefig(path)
@@ -173,7 +177,7 @@ class Figures:
             above.set_title(group, fontsize="small")
             below.set_xlabel("time (s)")
         rows[0, 0].set_ylabel(_signal_name(episodes(records, groups[0])[0]["position"]))
-        rows[1, 0].set_ylabel("σ: shown (black), the encoder's")
+        rows[1, 0].set_ylabel(r"$\sigma$: shown (black), the encoder's")
         figure.suptitle(f"{experiment.title}: seed {cell.seed}", fontsize="medium")
         figure.savefig(path)
 
@@ -196,7 +200,7 @@ def _envs(measured: list[tuple[Cell, dict]]) -> list[str]:
 
 def _first_of_each(experiment: Experiment, measured: list[tuple[Cell, dict]]) -> list[Cell]:
     """The first measured seed of every column, in their order."""
-    cells = {}
+    cells: dict[tuple[str, str], Cell] = {}
     for cell, _ in measured:
         cells.setdefault((cell.env, cell.variant), cell)
     order = {variant_of(column): i for i, column in enumerate(experiment.columns)}

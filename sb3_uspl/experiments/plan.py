@@ -1,5 +1,6 @@
 """What has to be trained for a table or a figure: a grid of cells, each with its complete configuration."""
 
+import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -142,6 +143,7 @@ class Plan:
         self.variants = {name: Variant(name, **given) for name, given in data["variants"].items()}
         self.budgets = {name: Budget(name, **given) for name, given in data["budgets"].items()}
         self.experiments = {name: Experiment(name, **given) for name, given in data["experiments"].items()}
+        self._entries = functools.cache(lambda file: load_entries(CONFIGS / file))
         for experiment in self.experiments.values():
             unknown = [column for column in experiment.columns if variant_of(column) not in self.variants]
             if unknown:
@@ -176,7 +178,7 @@ class Plan:
         :raises ValueError: if the variant has no hyperparameters for that environment
         """
         variant = self.variants[name]
-        entries = load_entries(CONFIGS / variant.file)
+        entries = self._entries(variant.file)
         entry = entries.get(env, entries.get("default"))
         if entry is None:
             raise ValueError(f"{variant.file} has no entry for {env} and no default, only {sorted(entries)}.")

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl.evaluation import EVALUATION_SEED, EpisodeRecord, run_episodes
 from sb3_uspl.observations import COMMON, PRIVILEGED
-from sb3_uspl.policies import USPLPolicy
+from sb3_uspl.policies import DeploymentState, USPLPolicy
 
 N_EPISODES = 8
 HIGH, LOW = 0.25, 0.01
@@ -74,7 +74,8 @@ def run_forced(
     venv.seed(seed)
     obs: Any = venv.reset()
     infos: list[dict[str, Any]] = venv.reset_infos
-    state, starts, t = None, np.ones(venv.num_envs, dtype=bool), 0
+    state: tuple[Any, ...] | None = None
+    starts, t = np.ones(venv.num_envs, dtype=bool), 0
     while alive.any():
         uncertainty = schedule(t)
         truth = obs[PRIVILEGED] if privileged else None
@@ -82,10 +83,11 @@ def run_forced(
         for i in np.flatnonzero(alive).tolist():
             records[i].positions.append(np.asarray(infos[i].get("position", obs[COMMON][i])))
             records[i].truth.append(obs[PRIVILEGED][i].copy())
+            assert isinstance(state, DeploymentState)
             records[i].belief_mean.append(state.belief_mean[i])
             records[i].belief_std.append(state.uncertainty[i])
             shown[i].append(np.nan if uncertainty is None else uncertainty)
-        obs, rewards, starts, infos = venv.step(actions)  # type: ignore[assignment]
+        obs, _, starts, infos = venv.step(actions)  # type: ignore[assignment]
         for i in np.flatnonzero(alive & starts).tolist():
             records[i].success = bool(infos[i].get("is_success", False))
             alive[i] = False
@@ -118,7 +120,7 @@ def record_all(model: BaseAlgorithm, venv: VecEnv, env: gym.Env) -> dict[str, np
 
 
 def _arrays(group: str, records: Sequence[EpisodeRecord], belief_in_world: Any) -> dict[str, np.ndarray]:
-    out = {}
+    out: dict[str, np.ndarray] = {}
     for i, record in enumerate(records):
         what = {
             "position": np.stack(record.positions),

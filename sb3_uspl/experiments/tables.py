@@ -11,11 +11,11 @@ from sb3_uspl.experiments.results import Summary, interquartile_mean
 NOT_RUN = "not run"
 NOTES = {
     "success": (
-        "Success in %: mean ± standard deviation over the seeds; below, the interquartile mean and its 95 % bootstrap interval "
+        "Success in %: mean ± deviation over the seeds; below, the interquartile mean and its 95 % bootstrap interval "
         "(rliable). One seed has neither deviation nor interval. Every started episode counts, time-outs are failures."
     ),
     "seconds": (
-        "Seconds an iteration (rollout, updates, and the training's own evaluations), mean ± standard deviation over the seeds. "
+        "Seconds an iteration (rollout, updates, and the training's own evaluations), mean ± deviation over the seeds. "
         "Only cells that ran on the same machine with as many others beside them can be compared: see the CSV."
     ),
 }
