@@ -246,10 +246,15 @@ class BiasedQuadrotor(Task):
         :param rng: source of all randomness
         """
         c = self.config
-        bounds = np.array((c.altitude_bias, c.angle_bias, c.angle_bias))
-        altitude_bias, roll_bias, pitch_bias = self.biases = tuple((bounds * rng.uniform(-1.0, 1.0, 3)).tolist())
-        altitude = float(rng.uniform(*c.start_altitude))
-        roll, pitch = rng.uniform(-c.start_tilt, c.start_tilt, 2).tolist()
+        first, second, third, altitude, roll, pitch = rng.uniform(-1.0, 1.0, 6).tolist()
+        self.biases = altitude_bias, roll_bias, pitch_bias = (
+            c.altitude_bias * first,
+            c.angle_bias * second,
+            c.angle_bias * third,
+        )
+        least, greatest = c.start_altitude
+        altitude = least + 0.5 * (greatest - least) * (1.0 + altitude)
+        roll, pitch = c.start_tilt * roll, c.start_tilt * pitch
         self._aloft = Aloft(altitude - altitude_bias, roll - roll_bias, pitch - pitch_bias)
         return Start(0.0, 0.0, 0.0, {})
 
