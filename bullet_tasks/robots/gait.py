@@ -41,13 +41,15 @@ _LEAST_FOLD, _MOST_FOLD = 0.93, 2.68  # rad, joint limits of the knee
 # Columns of a scene's array, as in ``bullet_tasks.kernels``.
 _X, _Y, _COS, _SIN, _HALF_X, _HALF_Y, _BOTTOM, _TOP, _ROUND, _SOLID, _FLOOR = range(11)
 
-# Places that a foot may be moved to, nearest first: rings of eight.
-_RINGS = (0.04, 0.08, 0.12, 0.16)  # m
-_PLACES = np.array(
-    [(0.0, 0.0)] + [(r * math.cos(k * math.pi / 4.0), r * math.sin(k * math.pi / 4.0)) for r in _RINGS for k in range(8)],
-    dtype=np.float64,
+# Places that a foot may be moved to, nearest first: fine rings of eight, so that it moves smoothly as the trunk goes along.
+_RINGS = np.arange(0.01, 0.165, 0.01)  # m
+_DIRECTIONS = np.arange(8) * (math.pi / 4.0)  # rad
+_PLACES = np.concatenate(
+    [np.zeros((1, 2)), *(r * np.stack((np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)), axis=1) for r in _RINGS)]
 )
 _STEP_CLIMBED = 0.13  # m; what differs more in height from where the foot stands is no place for it
+_GRAVITY = 9.81  # m/s^2
+_NOTICED = 0.1  # part of a new foothold's displacement that the edge reflex takes in at every step
 _TOUCH_DOWN_LATEST = -0.10  # m; a foot comes no nearer to the trunk than this
 
 
@@ -63,6 +65,10 @@ class Gait:
     :param neutral_shift: how far ahead of the hips the feet stand, m
     :param forward_capture: how much further ahead a foot is set for every m/s that the trunk is too fast, s (Raibert)
     :param sideways_capture: the same to the side, s
+    :param speed_feedback: how much faster the feet are moved for every m/s that the trunk is too slow
+    :param sideways_feedback: the same to the side: in a turn, it keeps the trunk from sliding outwards
+    :param turn_feedback: the same for the yaw rate
+    :param lean: how far feet are set outwards in a turn, relative to what centrifugal force asks for
     :param speed_trim: gain that removes lasting errors of the speed, 1/s
     :param speed_trim_limit: m/s
     :param turn_trim: the same for the yaw rate, 1/s
@@ -72,37 +78,53 @@ class Gait:
     :param pitch_feedback: extra pitch of the feet for every rad of error
     :param roll_feedback: the same for the roll
     :param speed_filter: time constant that the measured velocity is smoothed with, s
+    :param turn_filter: the same for the yaw rate, s
     :param height_filter: time constant with which the trunk's height follows the ground under the feet, s
     :param slope_filter: the same for the trunk's pitch on stairs, s
     :param slope_gain: part of the terrain's slope that the trunk takes on
     :param edge: how far from an edge or a wall a foot is set down, m
+    :param edge_reflex: how fast the trunk is moved to the side for every m that a foot is set down beside its place, 1/s
     :param acceleration: greatest change of the speed, m/s^2
-    :param heading_gain: yaw rate for every rad of heading error, 1/s
+    :param turn_limit: greatest yaw rate that the feet are moved for, rad/s
+    :param turn_acceleration: greatest change of the yaw rate, rad/s^2
+    :param reach: how far from its neutral place a foot may get along either axis, m
+    :param heading_feedback: extra yaw rate for every rad that the heading lags behind, 1/s
+    :param heading_slack: how far the heading may lag behind before what it follows waits for it, rad
     :raises ValueError: if a number is not a possible choice
     """
 
-    period: float = 0.36
-    duty: float = 0.67
-    height: float = 0.285
-    clearance: float = 0.09
-    neutral_shift: float = -0.02
-    forward_capture: float = 0.06
-    sideways_capture: float = 0.06
-    speed_trim: float = 1.3
+    period: float = 0.32
+    duty: float = 0.703
+    height: float = 0.287
+    clearance: float = 0.073
+    neutral_shift: float = -0.008
+    forward_capture: float = 0.034
+    sideways_capture: float = 0.088
+    speed_feedback: float = 0.0
+    sideways_feedback: float = 0.4
+    turn_feedback: float = 0.0
+    lean: float = 0.25
+    speed_trim: float = 1.16
     speed_trim_limit: float = 0.24
     turn_trim: float = 1.0
     turn_trim_limit: float = 0.4
-    pitch_trim: float = 1.4
+    pitch_trim: float = 1.28
     pitch_trim_limit: float = 0.3
     pitch_feedback: float = 0.0
-    roll_feedback: float = 0.2
+    roll_feedback: float = 0.1
     speed_filter: float = 0.08
-    height_filter: float = 0.2
-    slope_filter: float = 0.45
-    slope_gain: float = 0.56
-    edge: float = 0.05
-    acceleration: float = 4.0
-    heading_gain: float = 8.0
+    turn_filter: float = 0.04
+    height_filter: float = 0.25
+    slope_filter: float = 0.255
+    slope_gain: float = 0.8
+    edge: float = 0.06
+    edge_reflex: float = 5.0
+    acceleration: float = 6.0
+    turn_limit: float = 2.6
+    turn_acceleration: float = 60.0
+    reach: float = 0.16
+    heading_feedback: float = 4.0
+    heading_slack: float = 0.3
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
@@ -110,7 +132,7 @@ class Gait:
                 raise ValueError(f"`{name}` must be a finite number, got {value}.")
             if value < 0.0 and name != "neutral_shift":
                 raise ValueError(f"`{name}` must be 0 or more, got {value}.")
-        for name in ("period", "clearance", "speed_filter", "height_filter", "slope_filter", "acceleration", "heading_gain"):
+        for name in ("period", "clearance", "speed_filter", "turn_filter", "height_filter", "slope_filter", "acceleration"):
             if getattr(self, name) == 0.0:
                 raise ValueError(f"`{name}` must be positive, got 0.")
         if not 0.5 <= self.duty < 1.0:
@@ -135,6 +157,10 @@ class Gait:
     _NEUTRAL_SHIFT,
     _FORWARD_CAPTURE,
     _SIDEWAYS_CAPTURE,
+    _SPEED_FEEDBACK,
+    _SIDEWAYS_FEEDBACK,
+    _TURN_FEEDBACK,
+    _LEAN,
     _SPEED_TRIM,
     _SPEED_TRIM_LIMIT,
     _TURN_TRIM,
@@ -144,27 +170,36 @@ class Gait:
     _PITCH_FEEDBACK,
     _ROLL_FEEDBACK,
     _SPEED_FILTER,
+    _TURN_FILTER,
     _HEIGHT_FILTER,
     _SLOPE_FILTER,
     _SLOPE_GAIN,
     _EDGE,
+    _EDGE_REFLEX,
     _ACCELERATION,
-    _HEADING_GAIN,
+    _TURN_LIMIT,
+    _TURN_ACCELERATION,
+    _REACH,
+    _HEADING_FEEDBACK,
+    _HEADING_SLACK,
 ) = range(len(dataclasses.fields(Gait)))
 
 # Entries of the gait's memory.
 (
     _PHASE,  # of the stride, 0 to 1
     _RAMPED,  # commanded speed after the limit of its change, m/s
+    _RAMPED_TURN,  # commanded yaw rate after the limit of its change, rad/s
     _SPEED_ERROR,  # trims: integrals of errors
     _TURN_ERROR,
     _PITCH_ERROR,
     _FORWARD,  # smoothed measured velocity, m/s
     _SIDEWAYS,
+    _TURNING,  # smoothed measured yaw rate, rad/s
+    _BESIDE,  # how far to the left of their places feet were set down of late, m
     _SLOPE,  # pitch that the terrain asks for, rad
     _TRUNK_Z,  # wanted height of the trunk's centre in the world, m
-) = range(9)
-_N_MEMORY = 9
+) = range(12)
+_N_MEMORY = 12
 
 # Entries of the measurements.
 TRUNK_X, TRUNK_Y, TRUNK_Z, ROLL, PITCH, YAW, FORWARD, SIDEWAYS, YAW_RATE = range(9)
@@ -265,9 +300,9 @@ def _firm(shapes: np.ndarray, lower_ground: float, x: float, y: float, height: f
     return True
 
 
-@_compiled(f"UniTuple(float64, 3)({_TABLE}, float64, float64, float64, float64, float64)")
+@_compiled(f"UniTuple(float64, 3)({_TABLE}, float64, float64, float64, float64, float64, float64)")
 def foothold(
-    shapes: np.ndarray, lower_ground: float, x: float, y: float, ground: float, edge: float
+    shapes: np.ndarray, lower_ground: float, x: float, y: float, ground: float, edge: float, yaw: float
 ) -> tuple[float, float, float]:
     """
     The place nearest to a point where a foot can stand, and its height, m; the point itself if there is none.
@@ -278,9 +313,11 @@ def foothold(
     :param y: m
     :param ground: height that the foot comes from, m
     :param edge: how far to keep from edges and walls, m
+    :param yaw: of the robot; other places are looked for ahead of it, behind, beside and between, rad
     """
+    c, s = math.cos(yaw), math.sin(yaw)
     for k in range(_PLACES.shape[0]):
-        place_x, place_y = x + _PLACES[k, 0], y + _PLACES[k, 1]
+        place_x, place_y = x + c * _PLACES[k, 0] - s * _PLACES[k, 1], y + s * _PLACES[k, 0] + c * _PLACES[k, 1]
         height = standing_height(shapes, lower_ground, place_x, place_y, edge)
         if abs(height - ground) <= _STEP_CLIMBED and _firm(shapes, lower_ground, place_x, place_y, height, edge):
             return place_x, place_y, height
@@ -300,21 +337,27 @@ def _clipped(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
-@_compiled(f"UniTuple(float64, 2)({_ROW}, {_ROW}, {_ROW}, float64, float64, float64)")
+@_compiled(f"UniTuple(float64, 3)({_ROW}, {_ROW}, {_ROW}, float64, float64, float64)")
 def _trimmed(
     gait: np.ndarray, memory: np.ndarray, measured: np.ndarray, dt: float, speed: float, yaw_rate: float
-) -> tuple[float, float]:
-    """Speed and yaw rate that the feet are moved for, so that the trunk's are those that are wanted."""
+) -> tuple[float, float, float]:
+    """Speed ahead, speed to the left and yaw rate that the feet are moved for, so that the trunk's are as they are wanted."""
     change = gait[_ACCELERATION] * dt
-    memory[_RAMPED] += max(-change, min(change, speed - memory[_RAMPED]))
+    memory[_RAMPED] += _clipped(speed - memory[_RAMPED], change)
+    change = gait[_TURN_ACCELERATION] * dt
+    memory[_RAMPED_TURN] += _clipped(yaw_rate - memory[_RAMPED_TURN], change)
     part = min(1.0, dt / gait[_SPEED_FILTER])
     memory[_FORWARD] += part * (measured[FORWARD] - memory[_FORWARD])
     memory[_SIDEWAYS] += part * (measured[SIDEWAYS] - memory[_SIDEWAYS])
+    memory[_TURNING] += min(1.0, dt / gait[_TURN_FILTER]) * (measured[YAW_RATE] - memory[_TURNING])
     error = memory[_RAMPED] - memory[_FORWARD]
     memory[_SPEED_ERROR] = _clipped(memory[_SPEED_ERROR] + dt * gait[_SPEED_TRIM] * error, gait[_SPEED_TRIM_LIMIT])
-    error = yaw_rate - measured[YAW_RATE]
+    ahead = memory[_RAMPED] + memory[_SPEED_ERROR] + gait[_SPEED_FEEDBACK] * error
+    error = memory[_RAMPED_TURN] - memory[_TURNING]
     memory[_TURN_ERROR] = _clipped(memory[_TURN_ERROR] + dt * gait[_TURN_TRIM] * error, gait[_TURN_TRIM_LIMIT])
-    return memory[_RAMPED] + memory[_SPEED_ERROR], yaw_rate + memory[_TURN_ERROR]
+    turn = _clipped(memory[_RAMPED_TURN] + memory[_TURN_ERROR] + gait[_TURN_FEEDBACK] * error, gait[_TURN_LIMIT])
+    aside = gait[_EDGE_REFLEX] * memory[_BESIDE] - gait[_SIDEWAYS_FEEDBACK] * memory[_SIDEWAYS]
+    return ahead, aside, turn
 
 
 @_compiled(f"UniTuple(float64, 2)({_ROW}, {_ROW}, {_TABLE}, {_ROW}, float64, float64)")
@@ -358,6 +401,9 @@ def _touch_down(
     y = s * neutral_x + c * neutral_y
     x += gait[_FORWARD_CAPTURE] * (memory[_FORWARD] - memory[_RAMPED])
     y += gait[_SIDEWAYS_CAPTURE] * memory[_SIDEWAYS]
+    y -= gait[_LEAN] * gait[_HEIGHT] / _GRAVITY * memory[_FORWARD] * yaw_rate
+    x = neutral_x + _clipped(x - neutral_x, gait[_REACH])
+    y = neutral_y + _clipped(y - neutral_y, gait[_REACH])
     # Where that is in the world at the time of landing.
     yaw = measured[YAW] + time_left * measured[YAW_RATE]
     c, s = math.cos(measured[YAW]), math.sin(measured[YAW])
@@ -365,9 +411,11 @@ def _touch_down(
     base_y = measured[TRUNK_Y] + time_left * (s * memory[_FORWARD] + c * memory[_SIDEWAYS])
     c, s = math.cos(yaw), math.sin(yaw)
     world_x, world_y = base_x + c * x - s * y, base_y + s * x + c * y
-    place_x, place_y, height = foothold(shapes, lower_ground, world_x, world_y, foot[_GROUND], gait[_EDGE])
+    place_x, place_y, height = foothold(shapes, lower_ground, world_x, world_y, foot[_GROUND], gait[_EDGE], yaw)
     dx, dy = place_x - world_x, place_y - world_y
-    return x + c * dx + s * dy, y + c * dy - s * dx, height
+    beside = c * dy - s * dx
+    memory[_BESIDE] += _NOTICED * (beside - memory[_BESIDE])
+    return x + c * dx + s * dy, y + beside, height
 
 
 @_compiled(f"void({_ROW}, {_ROW}, {_TABLE}, {_ROW}, {_TABLE}, float64, float64, UniTuple(float64, 3), {_TABLE})")
@@ -388,7 +436,7 @@ def _step(
     :param command: speed (m/s), yaw rate (rad/s), pitch (rad)
     :param angles: joint angles, rad, ``(4, 3)``
     """
-    speed, yaw_rate = _trimmed(gait, memory, measured, dt, command[0], command[1])
+    speed, sideways, yaw_rate = _trimmed(gait, memory, measured, dt, command[0], command[1])
     pitch, roll = _posture(gait, memory, feet, measured, dt, command[2])
     memory[_PHASE] = (memory[_PHASE] + dt / gait[_PERIOD]) % 1.0
     duty = gait[_DUTY]
@@ -396,11 +444,14 @@ def _step(
     for i in range(N_LEGS):
         foot = feet[i]
         # Diagonal legs step together.
+        neutral_x, neutral_y = FORE[i] * HIP_X + gait[_NEUTRAL_SHIFT], SIDE[i] * STANCE_WIDTH
         phase = (memory[_PHASE] + (0.0 if i in (0, 3) else 0.5)) % 1.0
         if phase < duty:
             foot[_SWINGS] = 0.0
-            x, y = foot[_FOOT_X] - speed * dt, foot[_FOOT_Y]
-            foot[_FOOT_X], foot[_FOOT_Y] = turn_c * x + turn_s * y, turn_c * y - turn_s * x
+            x, y = foot[_FOOT_X] - speed * dt, foot[_FOOT_Y] - sideways * dt
+            x, y = turn_c * x + turn_s * y, turn_c * y - turn_s * x
+            foot[_FOOT_X] = neutral_x + _clipped(x - neutral_x, gait[_REACH])
+            foot[_FOOT_Y] = neutral_y + _clipped(y - neutral_y, gait[_REACH])
             z = foot[_GROUND] + FOOT_RADIUS - memory[_TRUNK_Z]
             tilt, lean = pitch, roll
         else:
@@ -408,7 +459,7 @@ def _step(
             if foot[_SWINGS] == 0.0:
                 foot[_SWINGS] = 1.0
                 foot[_LIFT_X], foot[_LIFT_Y], foot[_LIFT_Z] = foot[_FOOT_X], foot[_FOOT_Y], foot[_GROUND]
-            leg = (FORE[i] * HIP_X + gait[_NEUTRAL_SHIFT], SIDE[i] * STANCE_WIDTH, speed, yaw_rate)
+            leg = (neutral_x, neutral_y, speed, yaw_rate)
             time_left = (1.0 - part) * (1.0 - duty) * gait[_PERIOD]
             x, y, height = _touch_down(gait, memory, foot, measured, shapes, lower_ground, time_left, leg)
             way = _smooth(part)

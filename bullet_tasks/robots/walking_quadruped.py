@@ -13,7 +13,7 @@ from bullet_tasks.ends import Judge, Outcome
 from bullet_tasks.robots import a1_model, gait
 from bullet_tasks.robots.base import Robot, RobotState, Stretch
 from bullet_tasks.robots.gait import FOOT_RADIUS, Gait, Trot
-from bullet_tasks.robots.quadruped_body import CONTACT_FORCE, MAX_YAW_RATE, SUBSTEP, QuadrupedCommand
+from bullet_tasks.robots.quadruped_body import CONTACT_FORCE, MAX_YAW_RATE, SUBSTEP, YAW_GAIN, QuadrupedCommand
 from bullet_tasks.simulation import quaternion
 from bullet_tasks.world import World
 
@@ -33,6 +33,7 @@ _BODY_FRICTION = 0.2  # the trunk slides along walls
 _PLACED_ABOVE = 0.002  # m
 _AWAY = 1000.0  # m
 _OTHER_BODY, _LINK, _NORMAL_FORCE = 2, 3, 9  # fields of a record of getContactPoints
+_AHEAD_TIME = 0.5  # s
 _HALF_TURN = math.pi + 1e-6  # rad; beyond it a heading is nearer the other way round
 
 
@@ -65,30 +66,10 @@ class WalkingPreset:
             raise ValueError(f"`motor_gain` must be greater than 0 and at most 1, got {self.motor_gain}.")
 
 
-FAST = WalkingPreset(physics_rate=60, iterations=20, motor_gain=0.3, meshes=False)
-"""The light model at 60 Hz."""
-ACCURATE = WalkingPreset(
-    physics_rate=120,
-    iterations=50,
-    motor_gain=0.5,
-    meshes=True,
-    gait=Gait(
-        duty=0.703,
-        height=0.287,
-        clearance=0.073,
-        neutral_shift=-0.008,
-        forward_capture=0.034,
-        sideways_capture=0.088,
-        speed_trim=1.16,
-        turn_trim=0.3,
-        pitch_trim=1.28,
-        roll_feedback=0.236,
-        height_filter=0.25,
-        slope_filter=0.255,
-        slope_gain=0.8,
-    ),
-)
-"""The A1 of ``pybullet_data`` at 120 Hz; its legs have all their shapes, which may hook on walls."""
+FAST = WalkingPreset(physics_rate=120, iterations=20, motor_gain=0.35, meshes=False)
+"""The light model at 120 Hz."""
+ACCURATE = WalkingPreset(physics_rate=240, iterations=50, motor_gain=0.2, meshes=True)
+"""The A1 of ``pybullet_data`` at 240 Hz; its legs have all their shapes, which may hook on walls."""
 
 
 class WalkingQuadruped(Robot[QuadrupedCommand]):
@@ -118,7 +99,8 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         self._world = world
         self._dt = 1.0 / preset.physics_rate
         self._steps = round(SUBSTEP * preset.physics_rate)
-        self._speed = self._target_yaw = self._pitch = 0.0
+        self._speed = self._target_yaw = self._reference = self._ahead = self._pitch = 0.0
+        self._forgotten = math.exp(-self._dt / _AHEAD_TIME)
         self._measured = np.zeros(gait.N_MEASUREMENTS)
         simulation = world.simulation
         simulation.configure(self._dt, _GRAVITY)
@@ -170,7 +152,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         :param phase: of the stride that the robot will begin with, 0 to 1
         """
         self.trot.reset(ground, phase)
-        self._speed, self._target_yaw, self._pitch = 0.0, yaw, 0.0
+        self._speed, self._target_yaw, self._reference, self._ahead, self._pitch = 0.0, yaw, yaw, 0.0, 0.0
         z = ground + FOOT_RADIUS + self.preset.gait.height
         angles = self.trot.angles.ravel().tolist()
         # Where nothing is in touch first, so that PyBullet forgets the contacts of the episode before.
@@ -201,6 +183,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         if abs(turn) > _HALF_TURN:
             turn = math.remainder(turn, math.tau)
         self._target_yaw = self.state.yaw + turn
+        self._ahead = self._reference - self.state.yaw
 
     def advance(self, n_substeps: int, judge: Judge) -> Stretch:
         """
@@ -220,11 +203,10 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         """Let 1/20 s pass (see base class)."""
         x0, y0 = self.state.x, self.state.y
         scene, measured = self._world.scene, self._measured
-        gain = self.preset.gait.heading_gain
         pressed = False
         yaw = self.state.yaw
         for _ in range(self._steps):
-            rate = max(-MAX_YAW_RATE, min(MAX_YAW_RATE, gain * (self._target_yaw - yaw)))
+            rate = self._turn(yaw)
             angles = self.trot.step(self._dt, (self._speed, rate, self._pitch), measured, scene.packed, scene.lower_ground)
             self._set_motors(
                 self._body,
@@ -243,6 +225,24 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         tilted = max(abs(self.roll), abs(self.pitch)) > FALLEN_TILT
         self.fallen = self.fallen or tilted or z - self.trot.ground < FALLEN_HEIGHT
         return self.state
+
+    def _turn(self, yaw: float) -> float:
+        """
+        Yaw rate that keeps the heading up with a body without legs.
+
+        :param yaw: rad
+        :return: rad/s
+        """
+        walking = self.preset.gait
+        # A turn begins where the last one will have brought the heading; in the end, the target counts.
+        self._ahead *= self._forgotten
+        error = self._target_yaw + self._ahead - self._reference
+        rate = max(-MAX_YAW_RATE, min(MAX_YAW_RATE, YAW_GAIN * error))
+        self._reference += rate * self._dt
+        # Held back by a wall, say, the robot is not to swing round once it is free.
+        slack = walking.heading_slack
+        self._reference = max(yaw - slack, min(yaw + slack, self._reference))
+        return rate + walking.heading_feedback * (self._reference - yaw)
 
     def _pressed(self) -> bool:
         """Whether anything but a floor pressed on the robot during the last physics step."""
