@@ -1,5 +1,6 @@
 """The arm with motors, gravity and cubes that weigh: the judge of policies that were trained without."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +20,8 @@ from bullet_tasks.robots.panda_arm import (
     PandaArm,
 )
 from bullet_tasks.robots.panda_body import ARM_JOINTS, CLOSED, FINGER_JOINTS, HAND, JOINTS, OPEN, PandaBody
-from bullet_tasks.shapes import Box, Vector3
+from bullet_tasks.scene import PARKED
+from bullet_tasks.shapes import Vector3
 from bullet_tasks.simulation import Simulation
 from bullet_tasks.world import World
 
@@ -52,7 +54,7 @@ class FullPanda(PandaArm):
     The arm in dynamics: joint motors follow a straight motion of the hand, a fixed constraint stands for the grasp (friction
     of simulated fingers creeps), and the load is what that constraint's force says.
 
-    The scene's cubes guide the eye; the ones that weigh are bodies of their own.
+    The scene's cubes cannot move by themselves; the ones that weigh are bodies of their own.
 
     :param world: see base class
     :param masses: see base class
@@ -69,19 +71,18 @@ class FullPanda(PandaArm):
         self._client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         self._step = simulation.step
         self._body = PandaBody(simulation)
-        half = 0.5 * EDGE
-        cube = Box("cube", (0.0, 0.0, 0.0), (half, half, half))
-        # The hidden ones wait side by side, so that none starts within another.
-        self._bodies = {
-            name: simulation.add_body(f"{name}_body", cube, (), (0.3, (i - 1) * 4 * EDGE, half), mass=1.0)
-            for i, name in enumerate(CUBES)
-        }
+        self._bodies = {name: self._add_cube(simulation, name) for name in CUBES}
         for body in self._bodies.values():
             self._client.changeDynamics(body, -1, lateralFriction=_FRICTION, restitution=0.0)
         self._constraint: int | None = None
         self._targets: Targets = iter(())
         self._load = 0.0
         self._pristine = simulation.save()
+
+    def _add_cube(self, simulation: Simulation, name: str) -> int:
+        shape = self.world.scene[name]
+        cube = dataclasses.replace(shape, centre=(0.0, 0.0, 0.0))
+        return simulation.add_body(f"{name}_body", cube, (cube,), shape.centre, mass=1.0)
 
     def reset(self, x: float, y: float, ground: float, yaw: float) -> ArmState:
         """
@@ -255,10 +256,9 @@ class FullPanda(PandaArm):
 
     def appear(self, simulation: Simulation) -> None:
         """
-        Put the cubes that guide the eye where the ones that weigh are (see base class).
+        Take the scene's cubes out of the picture, which shows the ones that weigh (see base class).
 
         :param simulation: that will take the picture
         """
-        for name in self.names:
-            position, orientation = self._client.getBasePositionAndOrientation(self._bodies[name])
-            self._client.resetBasePositionAndOrientation(simulation.body_id(name), position, orientation)
+        for name in CUBES:
+            simulation.place(name, PARKED)

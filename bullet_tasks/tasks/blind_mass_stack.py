@@ -182,7 +182,7 @@ class BlindMassStack(Task):
     :raises ValueError: if the configuration is not a possible world
     """
 
-    camera = Camera(eye=(1.55, 0.0, 0.75), target=(0.35, 0.0, 0.12), fov=42.0)
+    camera = Camera(eye=(1.45, 0.0, 0.65), target=(0.4, 0.0, 0.13), fov=36.0)
     picture_size = (640, 480)
     decision_period = DECISION_PERIOD
     discrete_privileged = {0: (-INDEX_SCALE, 0.0, INDEX_SCALE)}  # noqa: RUF012 (a mapping that nobody writes to)
@@ -208,7 +208,7 @@ class BlindMassStack(Task):
         c, half = self.config, 0.5 * EDGE
         thickness = _TABLE_HALF[2]
         table = Box("table", (_TABLE_X, 0.0, -thickness), _TABLE_HALF, colour=_TABLE, floor=True)
-        # Not solid: in the physics that weighs, they only show where the bodies are that do.
+        # Not solid: where anything collides with the cubes, they are bodies of the robot's physics.
         cubes = [
             Box(name, (c.place_x, (i - 1) * c.spacing, half), (half, half, half), colour=_COLOURS[name], solid=False)
             for i, name in enumerate(CUBES)
