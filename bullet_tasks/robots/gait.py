@@ -95,7 +95,7 @@ class Gait:
 
     period: float = 0.32
     duty: float = 0.703
-    height: float = 0.287
+    height: float = 0.2825
     clearance: float = 0.073
     neutral_shift: float = -0.008
     forward_capture: float = 0.034
