@@ -131,7 +131,9 @@ class Grid:
         first = checkpoint[1] if checkpoint else 0
         arguments = ["sb3_uspl.train", "--algo", cell.algo, "--env", cell.env, "--seed", str(cell.seed)]
         arguments += ["-conf", str(folder.config), "-f", str(folder.train), "-n", str(cell.timesteps - first)]
-        arguments += ["--save-freq", str(max(cell.timesteps // CHECKPOINTS_PER_TRAINING, n_envs))]
+        # Within a rollout, a checkpoint would hold no more than at its beginning.
+        rollout = n_envs * int(cell.hyperparameters.get("n_steps", 1))
+        arguments += ["--save-freq", str(max(cell.timesteps // CHECKPOINTS_PER_TRAINING, rollout))]
         arguments += ["--eval-freq", str(max(cell.timesteps // cell.evaluations, n_envs))]
         arguments += ["--eval-episodes", str(cell.evaluation_episodes)]
         arguments += ["--n-eval-envs", str(min(cell.evaluation_episodes, MAX_N_EVAL_ENVS))]

@@ -12,6 +12,11 @@ from sb3_uspl.experiments.results import Results, collect, interquartile_mean, s
 from sb3_uspl.experiments.tables import markdown
 
 
+@pytest.fixture(autouse=True)
+def few_bootstraps(monkeypatch):
+    monkeypatch.setattr("sb3_uspl.experiments.results.BOOTSTRAPS", 200)
+
+
 @pytest.fixture(scope="module")
 def plan():
     return Plan()
@@ -25,6 +30,15 @@ def test_summary_hand_computed():
     assert summary.iqm == pytest.approx(96.0)  # without the lowest and the highest quarter: (94 + 98) / 2
     low, high = summary.interval
     assert 90.0 <= low < summary.iqm < high <= 100.0
+
+
+def test_the_interval_is_the_same_every_time_and_leaves_the_global_generator_alone():
+    np.random.seed(5)
+    expected = np.random.uniform(size=3)
+    np.random.seed(5)
+    scores = np.random.default_rng(0).uniform(size=(5, 2))
+    assert interquartile_mean(scores) == interquartile_mean(scores)
+    np.testing.assert_array_equal(np.random.uniform(size=3), expected)
 
 
 def test_one_seed_has_a_mean_and_nothing_more():
