@@ -2,6 +2,7 @@
 
 from sb3_uspl import envs as envs  # registers the environments
 from sb3_uspl.baselines import RMA, PrivRecons, RESeLPolicy, RESeLPPO, RewReg
+from sb3_uspl.hidden import HiddenParameters
 from sb3_uspl.observations import PrivilegedObservation
 from sb3_uspl.policies import CnnPolicy, DeploymentState, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.uspl_ppo import USPLPPO
@@ -13,6 +14,7 @@ __all__ = [
     "USPLPPO",
     "CnnPolicy",
     "DeploymentState",
+    "HiddenParameters",
     "MlpPolicy",
     "MultiInputPolicy",
     "PrivRecons",
