@@ -65,6 +65,7 @@ class EpisodeReplayBuffer:
     :param max_bytes: budget of the replay
     :param keep: "mismatched" replays mismatched episodes only, as the authors' release does (all, if none is mismatched):
         in them the behaviour says nothing about the truth. "all" replays every episode, as the paper's Alg. 1 says.
+        As long as ``telltale`` is set, "mismatched" leaves the matched episodes of this iteration out as well.
     :param seed: of the sampling
     """
 
@@ -94,6 +95,8 @@ class EpisodeReplayBuffer:
         }
         if TARGET in observation_space.spaces:
             self._spec[TARGET] = (_shape(observation_space[TARGET]), observation_space[TARGET].dtype)  # type: ignore[assignment]
+        self.telltale = False
+        """Whether matched policies act on the plain truth now, so that their behaviour gives it away."""
         self.replay: deque[Episode] = deque()
         self.fresh: list[Episode] = []
         self.nbytes = 0
@@ -176,7 +179,9 @@ class EpisodeReplayBuffer:
                 yield EpisodeBatch({key: value[place] for key, value in staged.tokens.items()}, staged.truth[place], length)
 
     def _choose(self, n_tokens: int) -> list[Episode]:
-        sources = [source for source in (self.fresh, self.replay) if source]
+        only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
+        fresh = [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
+        sources = [source for source in (fresh, self.replay) if source]
         episodes: list[Episode] = []
         for source in sources:
             count = 0

@@ -30,6 +30,10 @@ from sb3_uspl.observations import (
 )
 from sb3_uspl.uncertainty import INITIAL_STD, smooth
 
+BELIEF_SHARE = 0.3
+"""Gain of the encoder's mean as an input, relative to the privileged observation's: at an equal gain, a policy that may take
+either relies on the mean before the encoder is worth it."""
+
 
 class DeploymentState(NamedTuple):
     """What the deployment policy carries from one decision to the next; numpy arrays, environments first."""
@@ -80,12 +84,11 @@ class PolicyFeatures(BaseFeaturesExtractor):
         """
         parts = [self.common_normalizer(obs[COMMON]), obs[self.privileged_key] * self.privileged_gain]
         if self.uncertainty_input:
-            # Log scale, as the reward transformation: MIN_STD -> -1, INITIAL_STD -> 1.
-            middle = 0.5 * (math.log(INITIAL_STD) + math.log(MIN_STD))
-            half = 0.5 * (math.log(INITIAL_STD) - math.log(MIN_STD))
-            parts.append((th.log(obs[UNCERTAINTY].clamp(min=MIN_STD)) - middle) / half)
+            # Log scale, as the reward transformation: INITIAL_STD -> 0, MIN_STD -> -1. The warm-up knows little but 0, so
+            # that certainty, when it comes, does not act through weights that grew as a bias.
+            parts.append(-th.log(obs[UNCERTAINTY].clamp(min=MIN_STD) / INITIAL_STD) / math.log(MIN_STD / INITIAL_STD))
         if self.mean_input:
-            parts.append(obs[BELIEF] * self.privileged_gain)
+            parts.append(obs[BELIEF] * (self.privileged_gain * BELIEF_SHARE))
         return th.cat(parts, dim=1)
 
 

@@ -84,6 +84,9 @@ class USPLPPO(PPO):
         quarter, or none (with a warning) if that is fewer than two environments.
     :param mismatch_hold_time: least and greatest mean time in s after which a mismatched environment is shown another one's
         privileged observation, spread over the environments. None: once a rollout (release).
+    :param wander_share: share of time in which a mismatched environment repeats a random action of its own, so that the
+        encoder sees what the policy does not look at yet (0 in the release)
+    :param wander_time: least and greatest length of such a stretch in s
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
     :param replay_bytes: memory budget of the episode replay
     :param encoder_learning_rate: of the encoder; constant, as in the release, unless a schedule is given (Tables 4 and 5: 5e-5
@@ -92,6 +95,7 @@ class USPLPPO(PPO):
     :param encoder_batch_size: decisions per encoder update, in whole episodes (Tables 4 and 5: 8000, 16000)
     :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170)
     :param encoder_max_grad_norm: gradient clipping of the encoder
+    :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1 as it stands
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
     :param encoder_bf16: whether the encoder's update computes in bfloat16 where torch's autocast deems it safe; for GPUs
     :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; takes minutes at the start, meant
@@ -156,6 +160,8 @@ class USPLPPO(PPO):
         decision_period: float | None = None,
         mismatch_fraction: float | None = None,
         mismatch_hold_time: tuple[float, float] | None = None,
+        wander_share: float = 0.0,
+        wander_time: tuple[float, float] = (0.5, 5.0),
         replay: str = "mismatched",
         replay_bytes: int = 256_000_000,
         encoder_learning_rate: float | Schedule = 1e-3,
@@ -163,6 +169,7 @@ class USPLPPO(PPO):
         encoder_batch_size: int = 4096,
         encoder_updates: int = 16,
         encoder_max_grad_norm: float = 1.0,
+        encoder_beta: float = 0.5,
         encoder_warmup: bool = True,
         encoder_bf16: bool = False,
         encoder_compile: bool = False,
@@ -217,11 +224,13 @@ class USPLPPO(PPO):
         self.smoothing_time, self.decision_period = smoothing_time, decision_period
         self.mismatch_fraction = mismatch_fraction
         self.mismatch_hold_time = mismatch_hold_time
+        self.wander_share, self.wander_time = wander_share, wander_time
         self.replay, self.replay_bytes = replay, replay_bytes
         self.encoder_learning_rate = encoder_learning_rate
         self.encoder_weight_decay = encoder_weight_decay
         self.encoder_batch_size, self.encoder_updates = encoder_batch_size, encoder_updates
         self.encoder_max_grad_norm, self.encoder_warmup = encoder_max_grad_norm, encoder_warmup
+        self.encoder_beta = encoder_beta
         self.encoder_bf16, self.encoder_compile = encoder_bf16, encoder_compile
         self.context_length = context_length
         self._rollout_env: UncertaintyVecWrapper | None = None
@@ -279,7 +288,9 @@ class USPLPPO(PPO):
             delta=self.delta,
             discrete_privileged=self.discrete_privileged,
             n_mismatched=self.n_mismatched,
-            mismatch_hold=self._mismatch_hold(),
+            mismatch_hold=self._in_decisions("mismatch_hold_time"),
+            wander_share=self.wander_share,
+            wander_hold=self._in_decisions("wander_time") or (1.0, 1.0),
         )
         self._rollout_env = None
 
@@ -322,6 +333,8 @@ class USPLPPO(PPO):
             "encoder_batch_size": (self.encoder_batch_size, 1, np.inf),
             "context_length": (self.context_length, 1, np.inf),
             "action_std": (1.0 if self.action_std is None else self.action_std, 1e-6, np.inf),
+            "encoder_beta": (self.encoder_beta, 0, 1),
+            "wander_share": (self.wander_share, 0, 1),
             "mismatch_fraction": (self.mismatch_fraction or 0.0, 0, 0.9),
             "decision_period": (1.0 if self.decision_period is None else self.decision_period, 1e-6, np.inf),
         }
@@ -348,14 +361,14 @@ class USPLPPO(PPO):
             f"use n_envs >= {needed}, a larger fraction, or mismatch_fraction=0."
         )
 
-    def _mismatch_hold(self) -> tuple[float, float] | None:
-        if self.mismatch_hold_time is None:
+    def _in_decisions(self, name: str) -> tuple[float, float] | None:
+        """Least and greatest time of that argument, in decisions."""
+        times = getattr(self, name)
+        if times is None:
             return None
-        low, high = (time / self.decision_period for time in self.mismatch_hold_time)  # type: ignore[operator]
+        low, high = (time / self.decision_period for time in times)  # type: ignore[operator]
         if not 0.0 < low <= high:
-            raise ValueError(
-                f"mismatch_hold_time={self.mismatch_hold_time}: give the least and the greatest mean time in s, both positive."
-            )
+            raise ValueError(f"{name}={times}: give the least and the greatest time in s, both positive.")
         return max(low, 1.0), max(high, 1.0)
 
     def _ask_discrete_privileged(self) -> dict[int, list[float]]:
@@ -405,13 +418,17 @@ class USPLPPO(PPO):
         assert self.env is not None and isinstance(self._last_obs, dict)
         wrapper = self._rollout_env
         if wrapper is None or wrapper.venv is not self.env or wrapper.encoder is not self.policy.encoder:
-            wrapper = UncertaintyVecWrapper(self.env, self.policy.encoder, self._uncertainty_config, self.seed)
+            wrapper = self._make_rollout_env(self.env)
             self._rollout_env, fresh = wrapper, True
         if fresh:
             assert self.rollout_buffer.episodes is not None
             self.rollout_buffer.episodes.forget_running()
             self._last_obs = wrapper.begin(self._last_obs)
         return result
+
+    def _make_rollout_env(self, env: VecEnv) -> UncertaintyVecWrapper:
+        """What the experience is collected in; the baselines have others."""
+        return UncertaintyVecWrapper(env, self.policy.encoder, self._uncertainty_config, self.seed)
 
     @property
     def progress(self) -> float:
@@ -456,6 +473,7 @@ class USPLPPO(PPO):
         self.logger.record("uspl/progress", wrapper.progress)
         # An episode that ended with the rollout's last decision is over, though no observation has been added since.
         episodes.close_ended(wrapper.step_count)
+        episodes.telltale = wrapper.progress == 0.0
         if self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0):
             self._train_encoder(episodes)
             self.policy.encoder.eval()
@@ -482,13 +500,13 @@ class USPLPPO(PPO):
             with th.autocast(self.device.type, th.bfloat16, enabled=self.encoder_bf16):
                 belief, _ = forward(tokens, lengths)
             belief = Belief(belief.mean.float(), belief.log_std.float())
-            loss = gaussian_nll(belief, truth)
+            loss = gaussian_nll(belief, truth, self.encoder_beta)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             th.nn.utils.clip_grad_norm_(encoder.parameters(), self.encoder_max_grad_norm)
             optimizer.step()
             with th.no_grad():
-                metrics.append(th.stack((loss, (belief.mean - truth).abs().mean(), belief.std.mean())))
+                metrics.append(th.stack((gaussian_nll(belief, truth), (belief.mean - truth).abs().mean(), belief.std.mean())))
         # PPO clips the gradients of the whole policy; the encoder's must not be among them.
         optimizer.zero_grad(set_to_none=True)
         if metrics:

@@ -1,10 +1,13 @@
 """What turns an environment's experience into USPL's: encoder, blurring and reward transformation around any VecEnv."""
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
@@ -50,6 +53,8 @@ class UncertaintyConfig:
     discrete_privileged: dict[int, list[float]] = field(default_factory=dict)
     n_mismatched: int = 0
     mismatch_hold: tuple[float, float] | None = None
+    wander_share: float = 0.0
+    wander_hold: tuple[float, float] = (1.0, 1.0)
 
 
 class BlurNoise:
@@ -67,6 +72,10 @@ class BlurNoise:
         self.continuous = np.zeros((n_envs, n_privileged))
         self.threshold = np.ones((n_envs, n_privileged))
         self.replacement = np.zeros((n_envs, n_privileged))
+        # Eq. 4 compares the uncertainty with 1, the distance between two indices.
+        self.gap = np.ones(n_privileged)
+        for dim, values in config.discrete_privileged.items():
+            self.gap[dim] = np.diff(np.unique(values)).min()
 
     def redraw(self, rows: np.ndarray) -> None:
         """
@@ -80,6 +89,53 @@ class BlurNoise:
         self.threshold[rows] = self.rng.uniform(size=shape)
         for dim, values in self.config.discrete_privileged.items():
             self.replacement[rows, dim] = self.rng.choice(np.asarray(values), size=len(rows))
+
+
+class Wandering:
+    """
+    Stretches of time in which environments repeat an action of their own instead of the policy's.
+
+    What only a long detour shows is never seen by an encoder that learns from a policy which goes straight to its goal.
+    Repeated actions reach what independent noise does not (temporally extended epsilon-greedy, Dabney et al. 2021). Lengths
+    are log-uniform; a continuous action is drawn around the middle of its range, with a spread drawn anew each time.
+
+    :param n_envs: number of environments
+    :param action_space: Box, Discrete, MultiDiscrete or MultiBinary
+    :param share: of time that is spent wandering
+    :param hold: least and greatest length of a stretch in decisions
+    :param rng: random generator
+    """
+
+    def __init__(
+        self, n_envs: int, action_space: spaces.Space, share: float, hold: tuple[float, float], rng: np.random.Generator
+    ):
+        self.action_space, self.share, self.rng = action_space, share, rng
+        self.log_hold = math.log(hold[0]), math.log(hold[1])
+        self.left = np.zeros(n_envs, dtype=np.int64)
+        self.wandering = np.zeros(n_envs, dtype=bool)
+        self.actions = np.stack([action_space.sample() for _ in range(n_envs)])
+
+    def apply(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: the policy's, ``(n_envs, ...)``
+        :return: those that are taken
+        """
+        due = np.flatnonzero(self.left == 0)
+        self.left[due] = np.ceil(np.exp(self.rng.uniform(self.log_hold[0], self.log_hold[1], len(due)))).astype(np.int64)
+        self.left -= 1
+        self.wandering[due] = self.rng.uniform(size=len(due)) < self.share
+        for row in due[self.wandering[due]]:
+            self.actions[row] = self._draw()
+        shape = (len(actions), *[1] * (actions.ndim - 1))
+        return np.where(self.wandering.reshape(shape), self.actions, actions).astype(actions.dtype)
+
+    def _draw(self) -> Any:
+        space = self.action_space
+        if not isinstance(space, spaces.Box):
+            return space.sample()
+        middle, half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
+        spread = self.rng.uniform() ** 3
+        return np.clip(middle + half * spread * self.rng.standard_normal(space.shape), space.low, space.high)
 
 
 class UncertaintyVecWrapper(VecEnvWrapper):
@@ -113,6 +169,11 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self._matched = np.arange(self.num_envs) < self.num_envs - config.n_mismatched
         if config.mismatch_hold is not None:
             self._redraw_rate = 1.0 / np.geomspace(*config.mismatch_hold, config.n_mismatched)
+        self._wandering: Wandering | None = None
+        if config.wander_share > 0.0 and config.n_mismatched > 0:
+            self._wandering = Wandering(
+                config.n_mismatched, venv.action_space, config.wander_share, config.wander_hold, self.rng
+            )
 
     def reset(self) -> VecEnvObs:
         return self.begin(self.venv.reset())  # type: ignore[arg-type]
@@ -147,6 +208,9 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self._source[first + due] = first + (due + self.rng.integers(1, n, len(due))) % n
 
     def step_async(self, actions: np.ndarray) -> None:
+        if self._wandering is not None:
+            first = self.num_envs - self.config.n_mismatched
+            actions = np.concatenate((actions[:first], self._wandering.apply(actions[first:])))
         self.previous_action = encode_actions(actions, self.action_space)
         self.venv.step_async(actions)
 
@@ -225,7 +289,9 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         ).astype(np.float32)
         if config.discrete_privileged:
             dims = list(config.discrete_privileged)
-            replaced = blur_discrete(privileged, std, noise.threshold[rows], noise.replacement[rows], self.progress)
+            replaced = blur_discrete(
+                privileged, std / noise.gap, noise.threshold[rows], noise.replacement[rows], self.progress
+            )
             shown[:, dims] = replaced[:, dims]
         return shown
 

@@ -15,7 +15,12 @@ from sb3_uspl.observations import PRIVILEGED
 PRESETS: dict[str, dict[str, Any]] = {
     # Trains on two CPU cores.
     "small": dict(
-        hidden=(128,), trunk=(128,), embedding=(128,), head=(), memory_kwargs={"gru": {}, "transformer": {}}
+        hidden=(128,),
+        trunk=(128,),
+        embedding=(128,),
+        head=(),
+        frequencies=4,
+        memory_kwargs={"gru": {}, "transformer": {}},
     ),
     # Sizes of App. C.3.3 (non-image; the image branch is added when the target is an image).
     "paper": dict(
@@ -23,6 +28,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         trunk=(1024, 512, 256),
         embedding=(256, 128),
         head=(512, 256),
+        frequencies=0,
         memory_kwargs={"gru": {}, "transformer": {"n_heads": 16, "head_width": 64}},
     ),
 }  # fmt: skip
@@ -56,16 +62,24 @@ def soft_clamp(x: th.Tensor, low: float, high: float) -> th.Tensor:
     return low + F.softplus(x - low)
 
 
-def gaussian_nll(belief: Belief, truth: th.Tensor) -> th.Tensor:
+def gaussian_nll(belief: Belief, truth: th.Tensor, beta: float = 0.0) -> th.Tensor:
     """
     Negative log-likelihood of the truth, Eq. 1: summed over privileged dimensions, averaged over tokens.
 
+    With ``beta`` each dimension is weighted by ``std ** (2 * beta)``, through which no gradient flows (beta-NLL, Seitzer et
+    al. 2022). In the plain likelihood (0) the errors of a dimension count by 1 / std**2: the noise of one that is known well
+    drowns the first hints about another.
+
     :param belief: predicted Gaussians, ``(n_tokens, n_privileged)``
     :param truth: privileged observations, same shape
+    :param beta: in [0, 1]
     :return: scalar loss
     """
     z = (truth - belief.mean) * th.exp(-belief.log_std)
-    return (0.5 * z**2 + belief.log_std + 0.5 * math.log(2.0 * math.pi)).sum(-1).mean()
+    nll = 0.5 * z**2 + belief.log_std + 0.5 * math.log(2.0 * math.pi)
+    if beta > 0.0:
+        nll = nll * th.exp(2.0 * beta * belief.log_std.detach())
+    return nll.sum(-1).mean()
 
 
 class ObservationEncoder(nn.Module):
@@ -101,7 +115,7 @@ class ObservationEncoder(nn.Module):
             )
         sizes = {**PRESETS[preset], **(overrides or {})}
         n_privileged = space[PRIVILEGED].shape[0]  # type: ignore[index]
-        self.features = TokenFeatures(space, n_action, sizes["hidden"], sizes["trunk"])
+        self.features = TokenFeatures(space, n_action, sizes["hidden"], sizes["trunk"], sizes["frequencies"])
         self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
         self.embedding = mlp(self.memory.width, sizes["embedding"])
         if sizes["embedding"]:

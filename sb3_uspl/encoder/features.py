@@ -1,5 +1,6 @@
 """From one decision's observation to one feature vector."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -87,6 +88,30 @@ class RunningNormalizer(nn.Module):
         return ((x - self.mean) / self.var.sqrt().clamp(min=self.MIN_STD)).clamp(-self.LIMIT, self.LIMIT)
 
 
+class FourierFeatures(nn.Module):
+    """
+    Each input, and its sine and cosine at octaves from pi / 2 rad per unit on (Tancik et al. 2020).
+
+    A metre in a maze of eight is a small part of the input's range, and an MLP takes long to find a sharp edge there.
+
+    :param frequencies: number of octaves; 0 leaves the inputs as they are
+    """
+
+    def __init__(self, frequencies: int):
+        super().__init__()
+        self.frequencies = frequencies
+        self.factor = 1 + 2 * frequencies
+        """Features per input."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: ``(..., n_inputs)``, of about unit variance
+        :return: ``(..., n_inputs * factor)``
+        """
+        angles = [x * (0.5 * math.pi * 2.0**octave) for octave in range(self.frequencies)]
+        return th.cat([x, *[f(angle) for angle in angles for f in (th.sin, th.cos)]], dim=-1)
+
+
 class DepthCNN(nn.Module):
     """
     Image features of App. C.3.3: conv 5x5 (32), max-pool 2, conv 3x3 (64), two layers of 128, Tanh.
@@ -129,14 +154,16 @@ class TokenFeatures(nn.Module):
     :param n_action: number of encoded action values
     :param hidden: layers for each kind of input
     :param trunk: layers after the concatenation
+    :param frequencies: of :class:`FourierFeatures` for the common observation and the action
     """
 
-    def __init__(self, space: spaces.Dict, n_action: int, hidden: Sequence[int], trunk: Sequence[int]):
+    def __init__(self, space: spaces.Dict, n_action: int, hidden: Sequence[int], trunk: Sequence[int], frequencies: int = 0):
         super().__init__()
         common, target = space[COMMON], space.spaces.get(TARGET)
         assert isinstance(common, spaces.Box)
         self.common_normalizer = RunningNormalizer(common.shape[0] + n_action)
-        self.common = mlp(common.shape[0] + n_action, hidden)
+        self.common_fourier = FourierFeatures(frequencies)
+        self.common = mlp((common.shape[0] + n_action) * self.common_fourier.factor, hidden)
         width = hidden[-1]
         self.has_image = target is not None and is_image_space(target)
         self.has_vector_target = target is not None and not self.has_image
@@ -165,7 +192,7 @@ class TokenFeatures(nn.Module):
         :param tokens: ``(..., *shape of the key)``
         :return: ``(..., width)``
         """
-        parts = [self.common(self.common_normalizer(self._common_vector(tokens)))]
+        parts = [self.common(self.common_fourier(self.common_normalizer(self._common_vector(tokens))))]
         if self.has_vector_target:
             parts.append(self.target(self.target_normalizer(tokens[TARGET].float())))
         if self.has_image:

@@ -139,3 +139,14 @@ def test_mismatched_environments_never_enter_the_loss():
             actions = th.cat([sample.actions for sample in samples]).flatten()
             assert th.equal(actions, truth), round_
     assert len(buffer.episodes.fresh) == N_ENVS  # the encoder gets them all
+
+
+@pytest.mark.parametrize("telltale", [False, True])
+def test_behaviour_that_gives_the_truth_away_is_not_learned_from(telltale):
+    episodes = make_episodes(n_mismatched=1)
+    fill(episodes, lengths=[5] * N_ENVS, n_steps=6)
+    episodes.telltale = telltale
+    matched = [not episode.mismatched for episode in episodes.fresh]
+    chosen = [not episode.mismatched for _ in range(20) for episode in episodes._choose(40)]
+    assert any(matched) and not all(matched)
+    assert any(chosen) != telltale

@@ -13,6 +13,7 @@ from sb3_uspl.encoder import (
     MEMORIES,
     MIN_STD,
     Belief,
+    FourierFeatures,
     GRUMemory,
     ObservationEncoder,
     RunningNormalizer,
@@ -126,6 +127,29 @@ def test_eq_1_hand_computed():
     # Half squared z: 0.5, 0, 0, 0.5.
     expected = (0.5 + math.log(0.5) + math.log(2.0) + 0.5 + 2 * math.log(2 * math.pi)) / 2
     assert gaussian_nll(belief, truth).item() == pytest.approx(expected)
+
+
+def test_beta_weighs_a_dimension_by_its_own_uncertainty():
+    truth = th.tensor([[0.5, 1.0]])
+    gradients = {}
+    for beta in (0.0, 0.5, 1.0):
+        mean = th.zeros(1, 2, requires_grad=True)
+        gaussian_nll(Belief(mean, th.log(th.tensor([[0.01, 0.5]]))), truth, beta).backward()
+        gradients[beta] = mean.grad[0]
+    # -z / std = -error / std**2, times std ** (2 beta): at beta = 1 the error itself, however certain the belief.
+    for beta, gradient in gradients.items():
+        expected = -th.tensor([0.5, 1.0]) * th.tensor([0.01, 0.5]) ** (2 * beta - 2)
+        th.testing.assert_close(gradient, expected, rtol=1e-4, atol=0.0)
+
+
+def test_fourier_features_tell_apart_what_is_close():
+    features = FourierFeatures(4)
+    near = th.tensor([[1.0], [1.1]])
+    plain, rich = FourierFeatures(0)(near), features(near)
+    assert rich.shape == (2, features.factor) == (2, 9)
+    th.testing.assert_close(rich[:, :1], plain)
+    th.testing.assert_close(rich[0, 1], th.sin(th.tensor(0.5 * math.pi)))
+    assert (rich[0] - rich[1]).norm() > 10 * (plain[0] - plain[1]).norm()
 
 
 def test_soft_clamp_stays_inside_and_keeps_a_gradient():

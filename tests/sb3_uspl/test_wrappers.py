@@ -1,5 +1,7 @@
 """The uncertainty wrapper: right history, right scale, right privileged observation."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch as th
@@ -9,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_uspl.encoder import MEMORIES, ObservationEncoder
 from sb3_uspl.observations import POLICY_KEYS
 from sb3_uspl.uncertainty import INITIAL_STD, reward_coefficient
-from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
+from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper, Wandering
 from tests.sb3_uspl.toy import ToyEnv
 
 
@@ -129,7 +131,8 @@ def test_discrete_values_are_replaced_by_valid_ones_as_often_as_eq_4_says():
     obs = wrapper.reset()
     assert set(np.unique(obs["privileged"])) <= {np.float32(v) for v in values}
     changed = (obs["privileged"] != obs["truth"]).mean()
-    assert changed == pytest.approx(obs["uncertainty"].mean() * 2 / 3, abs=0.04)  # a third draws the same value
+    # Uncertainty counts in steps from one value to the next; a third draws the same value.
+    assert changed == pytest.approx(np.minimum(obs["uncertainty"] / 0.25, 1.0).mean() * 2 / 3, abs=0.04)
 
 
 def test_mismatched_environments_change_their_minds_at_their_own_rates():
@@ -195,3 +198,23 @@ def test_discrete_actions_reach_the_encoder_one_hot():
     wrapper.reset()
     obs, *_ = wrapper.step(np.array([2, 0]))
     np.testing.assert_array_equal(obs["previous_action"], [[0, 0, 1], [1, 0, 0]])
+
+
+def test_wandering_repeats_actions_for_its_share_of_the_time():
+    n_envs, n_steps = 200, 400
+    wandering = Wandering(n_envs, spaces.Box(-2.0, 1.0, (1,)), 0.3, (2.0, 8.0), np.random.default_rng(0))
+    taken = np.array([wandering.apply(np.full((n_envs, 1), 9.0, np.float32))[:, 0] for _ in range(n_steps)])
+    away = taken != 9.0
+    assert away.mean() == pytest.approx(0.3, abs=0.02)
+    assert taken[away].min() >= -2.0 and taken[away].max() <= 1.0 and taken[away].mean() == pytest.approx(-0.5, abs=0.05)
+    lengths = [len(list(run)) for column in taken.T for action, run in itertools.groupby(column) if action != 9.0]
+    assert min(lengths[1:-1]) >= 1 and max(lengths) > 4 and len(set(taken[away].tolist())) > 100
+
+
+def test_only_mismatched_environments_wander():
+    wrapper = make_wrapper(6, n_mismatched=2, wander_share=1.0, wander_hold=(3.0, 3.0))
+    wrapper.reset()
+    action = np.array([wrapper.action_space.low + 1e-3] * 6, dtype=np.float32)
+    wrapper.step(action)
+    np.testing.assert_array_equal(wrapper.previous_action[:4], action[:4])
+    assert (wrapper.previous_action[4:] != action[4:]).all()
