@@ -128,7 +128,7 @@ with tempfile.TemporaryDirectory() as folder:
     display(Image(data=picture.read_bytes(), width=560))
 
 # %% [markdown]
-# Some episodes end at the first goal, never having known; the others go on, σ collapses, and the error with it.
+# About half of the episodes end at the first end (lowest panel), never having known. In the others σ collapses, and the error with it.
 #
 # ## The uncertainty set by hand (Fig. 15)
 #
@@ -151,12 +151,15 @@ venv.close()
 env.close()
 
 # %% [markdown]
-# Told that it knows, the policy goes straight to the goal; told that it does not, it ignores what it is shown and keeps looking.
+# Told all the time that it knows nothing, the policy does what it always does: to the end that it faces, then to the other. Told
+# from the first decision that it knows, which never happened in training, it is another robot: many paths end early, off the edge
+# of the corridor, and success falls with σ. It takes σ at its word, so σ must be honest: that is what notebook 2 is about. (In the
+# paper's Fig. 15 the robot is told so after it has explored: exercise 1.)
 #
 # ## Exercises
 #
-# 1. Show the policy the *wrong* goal and a small σ (`model.policy.act(..., privileged=..., uncertainty=...)`). What does it do
-#    when it arrives?
+# 1. Let the robot explore for 24 decisions, then set σ by hand (`model.policy.act(..., privileged=..., uncertainty=...)`): low, with
+#    the true goal; low, with the wrong one; high again half-way. What does it do each time?
 # 2. Film RMA beside USPL: `make demo` trains both.
 # 3. Evaluate the agent with legs: `python -m sb3_uspl.evaluate --algo uspl_ppo --env LateralChoice-v0 --physics full`.
 # 4. Find the σ at which the policy changes its mind, to within 0.01, by bisection.
