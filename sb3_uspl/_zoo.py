@@ -29,6 +29,7 @@ import bullet_tasks as bullet_tasks  # registers the environments
 from bullet_tasks.vec_env import BulletVecEnv
 from sb3_uspl import RMA, USPLPPO, PrivRecons, RESeLPPO, RewReg
 from sb3_uspl._configs import CONFIGS, load_entries
+from sb3_uspl._optimize import register_samplers
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAINED_AGENTS = ROOT / "trained_agents"
@@ -74,6 +75,8 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     default_vec_env_cls = BulletVecEnv
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        if is_ours(self.env_name.gym_id):
+            self.monitor_kwargs.setdefault("info_keywords", ("is_success",))  # for plot_train -y success
         seed = self.seed
         self.seed = seed + EVALUATION_OFFSET if eval_env else seed
         try:
@@ -101,7 +104,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             return
         # From zero again, blurring and reward transformation would start over with a warm-up, on a policy that is past it.
         learn = functools.partial(model.learn, reset_num_timesteps=False)
-        super().learn(SimpleNamespace(learn=learn, env=model.env, policy=model.policy))
+        super().learn(SimpleNamespace(learn=learn, env=model.env, policy=model.policy))  # type: ignore[arg-type]
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -111,7 +114,16 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 def register() -> None:
     """Make our algorithms (``--algo uspl_ppo``, ``rma``, ...) and environments known to the zoo's commands."""
     rl_zoo3.ALGOS.update(ALGORITHMS)
+    register_samplers()
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
+
+
+def is_ours(env_id: str) -> bool:
+    """
+    :param env_id: name of a registered environment
+    :return: whether it belongs to this project, so that its ``info`` has ``is_success``
+    """
+    return str(gym.registry[env_id].entry_point).startswith(_PACKAGES)
 
 
 def check_names(algo: str, env_id: str) -> None:
@@ -124,7 +136,7 @@ def check_names(algo: str, env_id: str) -> None:
         stock = sorted(set(rl_zoo3.ALGOS) - set(ALGORITHMS))
         raise ValueError(f"There is no algorithm '{algo}'. Ours: {sorted(ALGORITHMS)}; the zoo's: {stock}.")
     if env_id not in gym.registry:
-        ours = sorted(name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(_PACKAGES))
+        ours = sorted(filter(is_ours, gym.registry))
         close = difflib.get_close_matches(env_id, gym.registry, n=1)
         raise ValueError(
             f"There is no environment '{env_id}'{f' (did you mean {close[0]}?)' if close else ''}. Ours: {ours}. One of your "
