@@ -85,6 +85,7 @@ class Gait:
     :param edge: how far from an edge or a wall a foot is set down, m
     :param edge_reflex: how fast the trunk is moved to the side for every m that a foot is set down beside its place, 1/s
     :param acceleration: greatest change of the speed, m/s^2
+    :param pitch_rate: greatest change of the body pitch, rad/s: a jerk of the trunk would throw the robot over
     :param turn_limit: greatest yaw rate that the feet are moved for, rad/s
     :param turn_acceleration: greatest change of the yaw rate, rad/s^2
     :param reach: how far from its neutral place a foot may get along either axis, m
@@ -120,6 +121,7 @@ class Gait:
     edge: float = 0.06
     edge_reflex: float = 5.0
     acceleration: float = 6.0
+    pitch_rate: float = 0.8
     turn_limit: float = 2.6
     turn_acceleration: float = 60.0
     reach: float = 0.16
@@ -132,7 +134,16 @@ class Gait:
                 raise ValueError(f"`{name}` must be a finite number, got {value}.")
             if value < 0.0 and name != "neutral_shift":
                 raise ValueError(f"`{name}` must be 0 or more, got {value}.")
-        for name in ("period", "clearance", "speed_filter", "turn_filter", "height_filter", "slope_filter", "acceleration"):
+        for name in (
+            "period",
+            "clearance",
+            "speed_filter",
+            "turn_filter",
+            "height_filter",
+            "slope_filter",
+            "acceleration",
+            "pitch_rate",
+        ):
             if getattr(self, name) == 0.0:
                 raise ValueError(f"`{name}` must be positive, got 0.")
         if not 0.5 <= self.duty < 1.0:
@@ -177,6 +188,7 @@ class Gait:
     _EDGE,
     _EDGE_REFLEX,
     _ACCELERATION,
+    _PITCH_RATE,
     _TURN_LIMIT,
     _TURN_ACCELERATION,
     _REACH,
@@ -188,6 +200,7 @@ class Gait:
 (
     _PHASE,  # of the stride, 0 to 1
     _RAMPED,  # commanded speed after the limit of its change, m/s
+    _RAMPED_PITCH,  # the same for the body pitch, rad
     _RAMPED_TURN,  # commanded yaw rate after the limit of its change, rad/s
     _SPEED_ERROR,  # trims: integrals of errors
     _TURN_ERROR,
@@ -198,8 +211,8 @@ class Gait:
     _BESIDE,  # how far to the left of their places feet were set down of late, m
     _SLOPE,  # pitch that the terrain asks for, rad
     _TRUNK_Z,  # wanted height of the trunk's centre in the world, m
-) = range(12)
-_N_MEMORY = 12
+) = range(13)
+_N_MEMORY = 13
 
 # Entries of the measurements.
 TRUNK_X, TRUNK_Y, TRUNK_Z, ROLL, PITCH, YAW, FORWARD, SIDEWAYS, YAW_RATE = range(9)
@@ -371,7 +384,8 @@ def _posture(
     memory[_SLOPE] += min(1.0, dt / gait[_SLOPE_FILTER]) * (slope - memory[_SLOPE])
     height = 0.5 * (front + rear) + FOOT_RADIUS + gait[_HEIGHT]
     memory[_TRUNK_Z] += min(1.0, dt / gait[_HEIGHT_FILTER]) * (height - memory[_TRUNK_Z])
-    wanted = pitch + memory[_SLOPE]
+    memory[_RAMPED_PITCH] += _clipped(pitch - memory[_RAMPED_PITCH], gait[_PITCH_RATE] * dt)
+    wanted = memory[_RAMPED_PITCH] + memory[_SLOPE]
     error = wanted - measured[PITCH]
     memory[_PITCH_ERROR] = _clipped(memory[_PITCH_ERROR] + dt * gait[_PITCH_TRIM] * error, gait[_PITCH_TRIM_LIMIT])
     return wanted + memory[_PITCH_ERROR] + gait[_PITCH_FEEDBACK] * error, -gait[_ROLL_FEEDBACK] * measured[ROLL]

@@ -226,6 +226,16 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         self.fallen = self.fallen or tilted or z - self.trot.ground < FALLEN_HEIGHT
         return self.state
 
+    def push(self, vx: float, vy: float) -> None:
+        """
+        Hit the trunk: its velocity changes at once, and the gait has to cope.
+
+        :param vx: change along the world's x axis, m/s
+        :param vy: change along the world's y axis, m/s
+        """
+        (x, y, z), spin = self._get_velocity(self._body)
+        self._client.resetBaseVelocity(self._body, (x + vx, y + vy, z), spin)
+
     def _turn(self, yaw: float) -> float:
         """
         Yaw rate that keeps the heading up with a body without legs.

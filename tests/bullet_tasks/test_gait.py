@@ -111,7 +111,7 @@ def test_joint_angles_put_the_feet_where_they_are_to_be():
 
 def test_a_commanded_pitch_tilts_the_standing_feet():
     """Nose down: front feet higher in the trunk's frame, rear feet lower."""
-    trot = Trot(Gait())
+    trot = Trot(Gait(pitch_rate=1e6))
     trot.reset(0.0)
     angles = trot.step(DT, (0.0, 0.0, 0.3), standing(), HALL.packed, HALL.lower_ground)
     heights = feet_from_angles(angles)[:, 2]
