@@ -34,11 +34,16 @@ def parse_arguments(plan: Plan, arguments: Sequence[str] | None = None) -> argpa
     parser.add_argument("--jobs", type=int, default=2, help="cells at the same time")
     parser.add_argument("--model", choices=MODELS, default="best", help="of the training's evaluations; the CSV has both")
     parser.add_argument("--no-train", action="store_true", help="show what there is")
-    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "results", help="tables, pictures and raw results")
+    parser.add_argument(
+        "--output", type=Path, help="tables, pictures and raw results; default: docs/results, for smoke the folder of the logs"
+    )
     parser.add_argument("--logs", type=Path, default=Path("logs") / "experiments", help="trainings and checkpoints")
     given = parser.parse_args(arguments)
     if given.jobs < 1 or min(given.seeds) < 0 or len(set(given.seeds)) < len(given.seeds):
         parser.error("--jobs must be at least 1, and --seeds different numbers of at least 0.")
+    if given.output is None:
+        # Nobody should take a smoke test's numbers for results.
+        given.output = given.logs if given.budget == "smoke" else ROOT / "docs" / "results"
     return given
 
 

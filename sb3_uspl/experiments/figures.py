@@ -157,7 +157,7 @@ class Figures:
         rows[0, 0].set_ylabel("the robot's position")
         rows[1, 0].set_ylabel(r"belief: mean $\pm$ $\sigma$, truth dashed")
         rows[0, 0].legend(fontsize="x-small")
-        figure.suptitle(f"{experiment.title}: seed {cell.seed}", fontsize="medium")
+        figure.suptitle(f"{experiment.title}: {cell.env}, seed {cell.seed}", fontsize="medium")
         figure.savefig(path)
 
     def _forced(self, experiment: Experiment, measured: list[tuple[Cell, dict]], path: Path) -> None:
@@ -178,7 +178,7 @@ class Figures:
             below.set_xlabel("time (s)")
         rows[0, 0].set_ylabel(_signal_name(episodes(records, groups[0])[0]["position"]))
         rows[1, 0].set_ylabel(r"$\sigma$: shown (black), the encoder's")
-        figure.suptitle(f"{experiment.title}: seed {cell.seed}", fontsize="medium")
+        figure.suptitle(f"{experiment.title}: {cell.env}, seed {cell.seed}", fontsize="medium")
         figure.savefig(path)
 
 

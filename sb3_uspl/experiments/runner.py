@@ -1,6 +1,7 @@
 """Trains and measures the cells of a grid in child processes, as many at a time as asked for."""
 
 import fcntl
+import math
 import os
 import signal
 import subprocess
@@ -83,6 +84,7 @@ class Grid:
         self.failed: dict[str, str] = {}
         self._begin = time.monotonic()
         self._trained_decisions = 0
+        self._measuring_times: list[float] = []
 
     def run(self) -> dict[str, str]:
         """
@@ -160,6 +162,7 @@ class Grid:
         job.log.close()
         folder, cell, status = job.folder, job.folder.cell, job.child.wait()
         if job.phase == "measure":
+            self._measuring_times.append(time.monotonic() - job.begin)
             if status == 0 and self.results.has(cell):
                 folder.drop_checkpoints()
                 rate = self.results.read(cell)["models"]["best"]["success_rate"]
@@ -210,7 +213,10 @@ class Grid:
         left += sum(job.folder.cell.timesteps - now[job.folder.cell.name] for job in training)
         gone = self._trained_decisions + sum(now[job.folder.cell.name] - job.first for job in training)
         elapsed = time.monotonic() - self._begin
-        remaining = f"about {_clock(left * elapsed / gone)} left" if gone else "no estimate yet"
+        measuring = sum(self._measuring_times) / max(len(self._measuring_times), 1)
+        unmeasured = len(self.waiting) + len(training)
+        seconds = left * elapsed / gone + unmeasured * measuring / self.jobs if gone else math.inf
+        remaining = f"about {_clock(seconds)} left" if gone else "no estimate yet"
         done = self.n_cells - len(self.waiting) - len(self.running)
         states = []
         for job in self.running:

@@ -25,7 +25,8 @@ from tests.sb3_uspl.experiments.forked import ForkedChild
 
 PLAN = Plan()
 ENV = "TargetReaching-v0"
-TABLE1 = ["uspl", "rma", "rewreg", "privrecons", "resel_ppo", "recurrent_ppo", "frame_stacked_ppo"]
+TRAINED = ["uspl", "rewreg", "resel_ppo", "recurrent_ppo"]
+"""One of each kind; the others are for the slow test."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,9 +45,9 @@ def command(folder, experiments, *options):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """All experiments, with the trainings that table 1 needs."""
+    """All experiments, from a few trainings."""
     folder = tmp_path_factory.mktemp("experiments")
-    assert main(command(folder, PLAN.experiments, "--envs", ENV, "--only", *TABLE1), start=ForkedChild) == 0
+    assert main(command(folder, PLAN.experiments, "--envs", ENV, "--only", *TRAINED), start=ForkedChild) == 0
     return folder
 
 
@@ -57,16 +58,16 @@ def pages(folder):
 @pytest.mark.parametrize("name", PLAN.experiments)
 def test_every_experiment_leaves_a_page_a_csv_and_a_picture(folder, name):
     page = (pages(folder) / f"{name}.md").read_text()
-    assert f"sb3_uspl.experiments {name} --budget smoke --seeds 1" in page and f"![" in page
+    assert f"sb3_uspl.experiments {name} --budget smoke --seeds 1" in page and "![" in page
     assert (pages(folder) / f"{name}.png").stat().st_size > 5000
     rows = list(csv.DictReader((pages(folder) / f"{name}.csv").open()))
     unrun = {row["variant"] for row in rows if row["model"] == "not run"}
-    assert unrun == {row["variant"] for row in rows} - set(TABLE1)
+    assert unrun == {row["variant"] for row in rows} - set(TRAINED) and len(rows) > len(unrun)
     assert ("Not run: " in page) == bool(unrun)
 
 
 def test_a_result_says_where_it_comes_from(folder):
-    cells = [PLAN.cell(name, ENV, 1, PLAN.budgets["smoke"]) for name in TABLE1]
+    cells = [PLAN.cell(name, ENV, 1, PLAN.budgets["smoke"]) for name in TRAINED]
     results = Results(pages(folder) / "raw")
     for cell in cells:
         result = results.read(cell)
