@@ -201,8 +201,8 @@ for name, rule in rules.items():
 
 # %% [markdown]
 # Read it line by line. Under the task's own reward, going straight is best: this is what vanilla privileged learning teaches.
-# Under Eq. 2 going straight earns next to nothing, **although the target is reached**, because nobody knew; so the policy learns
-# to find out first, even if it could see the target. And there is a surprise: *right, then left* earns more than *left, then
+# Under Eq. 2 going straight earns next to nothing, **although the target is reached**, because nobody knew, and whoever
+# finds out first earns thirty times as much and more. And there is a surprise: *right, then left* earns more than *left, then
 # right*, though the target is more often at the left. A target found by chance at the first wall is hardly rewarded, one found
 # by knowing is rewarded three times over. Eq. 2 has no interest in being lucky, and pays for exploration whether it was needed
 # or not: here, for looking at the *less* likely side first, which costs 1.4 decisions on average. Taken to the extreme it would pay a

@@ -212,26 +212,15 @@ draw({"healthy": log, "negative rewards": negative})
 # rewards are losses, **ignorance is bliss**. The symptom: σ stays up, and the factor stays below 1 until the end. The cure: pay
 # for success and progress, as the paper's tasks do, and let time be punished by the discount.
 #
-# **2. Values that are too small.** `scale=0.01` instead of 0.25.
-
-# %%
-print("scale 0.01: ", end="")
-_, small = train(USPLPPO, scale=0.01)
-draw({"healthy": log, "scale 0.01": small})
-
-# %% [markdown]
-# The symptom: σ never comes near 0.2, so that the factor on the reward is above 1 from the start: what counts as ignorance in
-# Eq. 2 never occurs. The success above says how forgiving this small task is; a larger one has no reason to look. The cure is the
-# measurement at the top of this notebook.
-#
-# **3. The uncertainty hack.** σ falls although nothing was looked at, the prediction error falls with it, and the deployment policy
+# **2. The uncertainty hack.** σ falls although nothing was looked at, the prediction error falls with it, and the deployment policy
 # is at chance: the encoder reads the truth off the policy's behaviour. [Notebook 2](02_belief.ipynb) shows it; the cure is more
 # mismatched episodes. Here it cannot happen: whoever opens a box is done.
 #
 # ## Exercises
 #
-# 1. Set `warmup_timesteps=0, ramp_timesteps=0`. What becomes of the four curves? Why is this task indifferent to it?
-# 2. Make the boxes rattle truthfully in 80 % of the shakes only. How often does the player shake now, and is σ honest about it?
-# 3. Three boxes: what is the standard deviation of -1, 0, 1 with equal chances? Choose the scale. Then declare the value discrete
+# 1. Values that are too small: train with `scale=0.01`. Where do σ and the factor on the reward begin, and why? Did it matter here?
+# 2. Set `warmup_timesteps=0, ramp_timesteps=0`. What becomes of the four curves?
+# 3. Make the boxes rattle truthfully in 80 % of the shakes only. How often does the player shake now, and is σ honest about it?
+# 4. Three boxes: what is the standard deviation of -1, 0, 1 with equal chances? Choose the scale. Then declare the value discrete
 #    (`discrete_privileged={0: [...]}`), so that Eq. 4 applies to it.
-# 4. Take an environment of your own. Write down the answer to "what would it ask?" before you write the wrapper.
+# 5. Take an environment of your own. Write down the answer to "what would it ask?" before you write the wrapper.
