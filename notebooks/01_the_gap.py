@@ -137,9 +137,9 @@ axis.legend(fontsize="small")
 plt.show()
 
 # %% [markdown]
-# Where both targets are possible, the demonstrations contradict each other, and their mean is too timid by far: from the middle
-# the imitator drifts to one side because of the 55 %, and it never comes back. **No amount of data helps**: what is missing
-# is not accuracy but a reason to look. The expert has none.
+# Where both targets are possible, the demonstrations contradict each other and the imitator does what is right on average: it goes
+# to the side on which it happens to stand, which is the target's in about half of the episodes, and nothing ever makes it turn.
+# **No amount of data helps**: what is missing is not accuracy but a reason to look. The expert has none.
 #
 # ## Three ways to train
 #
@@ -217,9 +217,12 @@ for column, name in zip(axes.T, methods, strict=True):
 plt.show()
 
 # %% [markdown]
-# **Vanilla**: the privileged policy goes straight to its target. Shown a prediction that means "anywhere", the deployment
-# policy has no reason to go anywhere in particular. **Reward-regularised**: the two policies agree, by giving up what only one
-# of them can do. **USPL**: the deployment policy looks at one side first, and turns if the episode goes on.
+# **Vanilla**: the privileged policy goes straight to its target. Shown a prediction that means "anywhere", the deployment policy
+# runs to and fro in the middle. **Reward-regularised**: with this weight, reaching the target is worth more than the penalty, and
+# nothing has changed (exercise 3). **USPL**: the deployment policy looks at one side first, and turns if the episode goes on.
+# USPL's privileged policy does worse than its deployment policy, and the learning curve shows since when: shown the truth under
+# noise, it has not learned to ignore it for good, and is pulled back and forth. The deployment policy is shown a steady value. In
+# the paper's Fig. 1 the privileged policy explores as purposefully; ours does so in Lateral Choice (notebook 4).
 #
 # What made it turn? The uncertainty over an episode:
 
@@ -238,8 +241,8 @@ axes[1].text(1, 0.21, "knowing nothing", color="0.4")
 plt.show()
 
 # %% [markdown]
-# σ stays at 0.2, the standard deviation of the target's position in privileged units, until the first wall is reached. When the
-# episode goes on there, σ collapses, and the robot turns.
+# σ falls from its starting value to that of knowing nothing, 0.2, the standard deviation of the target's place in privileged units.
+# From the first wall on, where the episode should have ended, it falls to a tenth of that, and the robot turns.
 #
 # One seed proves little: the numbers above are one training each. Change `seed` and look again.
 #

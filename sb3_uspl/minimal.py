@@ -42,21 +42,21 @@ class Settings:
     delta: float = 0.05
     smoothing_time: float = 0.39
     """s, time constant of the uncertainty's smoothing."""
-    iterations: int = 100
+    iterations: int = 80
     episodes: int = 192
     """An iteration."""
-    warmup: float = 0.1
-    ramp: float = 0.3
+    warmup: float = 0.15
+    ramp: float = 0.4
     """Shares of the iterations in which the progress coefficient l is 0 and in which it rises to 1."""
-    gamma: float = 0.98
+    gamma: float = 0.95
     gae_lambda: float = 0.97
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     action_std: float = 0.35
-    final_share: float = 0.5
+    final_share: float = 0.2
     """Of learning rate and action noise at the end; both fall along a cosine."""
     clip_range: float = 0.2
-    epochs: int = 6
-    minibatch: int = 1024
+    epochs: int = 8
+    minibatch: int = 512
     """Decisions."""
     encoder_learning_rate: float = 1e-3
     encoder_updates: int = 8
@@ -356,8 +356,8 @@ def train(settings: Settings, verbose: bool = False) -> tuple[Agent, list[dict[s
         raise ValueError(f"{n_mismatched} of {settings.episodes} episodes mismatched: take none, or some but at least 2.")
     th.manual_seed(settings.seed)
     rng, agent, log = np.random.default_rng(settings.seed), Agent(settings), []
-    policy_optimizer = Adam([*agent.actor.parameters(), *agent.critic.parameters()], settings.learning_rate)
-    encoder_optimizer = Adam(agent.encoder.parameters(), settings.encoder_learning_rate)
+    policy_optimizer = Adam([*agent.actor.parameters(), *agent.critic.parameters()], settings.learning_rate, fused=True)
+    encoder_optimizer = Adam(agent.encoder.parameters(), settings.encoder_learning_rate, fused=True)
     replay: deque[Episodes] = deque(maxlen=settings.replay_iterations)
     first_mismatched = settings.episodes - n_mismatched
     for iteration in range(settings.iterations):
