@@ -97,7 +97,8 @@ class Wandering:
 
     What only a long detour shows is never seen by an encoder that learns from a policy which goes straight to its goal.
     Repeated actions reach what independent noise does not (temporally extended epsilon-greedy, Dabney et al. 2021). Lengths
-    are log-uniform; a continuous action is drawn around the middle of its range, with a spread drawn anew each time.
+    are log-uniform; a continuous action is drawn around the middle of its range, often close to it: each dimension's spread is
+    drawn anew.
 
     :param n_envs: number of environments
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary
@@ -134,7 +135,7 @@ class Wandering:
         if not isinstance(space, spaces.Box):
             return space.sample()
         middle, half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
-        spread = self.rng.uniform() ** 3
+        spread = self.rng.uniform(size=space.shape) ** 3
         return np.clip(middle + half * spread * self.rng.standard_normal(space.shape), space.low, space.high)
 
 

@@ -50,6 +50,8 @@ class Robot(ABC, Generic[CommandT]):
     substep_period: float
     """Time that one ``substep`` takes, s."""
     state: RobotState
+    fallen: bool = False
+    """Whether the robot has tipped over or sunk down since it was placed, which ends the episode; only one on legs can."""
 
     @abstractmethod
     def reset(self, x: float, y: float, ground: float, yaw: float) -> RobotState:

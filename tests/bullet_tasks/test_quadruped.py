@@ -116,7 +116,7 @@ def test_a_narrow_dead_end_lets_the_body_out_again(make):
     assert walk(robot, math.pi, 4.0)[-1].x < 0.0
 
 
-@pytest.mark.parametrize("physics", ["full", "legs"])
+@pytest.mark.parametrize("physics", ["", "legs"])
 def test_physics_that_does_not_exist_is_refused(physics):
     with pytest.raises(ValueError, match=f"{physics}.*available.*compiled.*kinematic"):
         make_quadruped(World(SceneSpec(())), physics)
