@@ -28,6 +28,7 @@ class ForkedChild:
         th.set_num_threads(1)
         for stream in (1, 2):
             os.dup2(log.fileno(), stream)
+        os.closerange(3, 1024)  # as Popen does: a child that outlives the runner must not hold its lock
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         sys.argv = [arguments[0], *arguments[1:]]
         try:
