@@ -136,7 +136,7 @@ def train(algorithm, scale=0.25, rewards=None, **arguments):
         **arguments,
     )
     log = Log()
-    model.learn(1024 if FAST else 20_000, callback=log)
+    model.learn(1024 if FAST else 30_000, callback=log)
     result = evaluate(model, venv, 10 if FAST else 200)
     print(
         f"deployment {result['success_rate']:6.1%} (privileged {result['privileged_success_rate']:6.1%}) after "
