@@ -98,6 +98,12 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             finally:
                 self.config = given
 
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        # The zoo would make a constant schedule of a number, of which our algorithms make a cosine (learning_rate_floor).
+        given = {"learning_rate": rate for rate in [hyperparams.get("learning_rate")] if isinstance(rate, int | float)}
+        return {**rl_zoo3.exp_manager.ExperimentManager._preprocess_schedules(hyperparams), **given}
+
     def learn(self, model: BaseAlgorithm) -> None:
         if not self.continue_training:
             super().learn(model)

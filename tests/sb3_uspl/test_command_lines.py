@@ -44,7 +44,7 @@ def run_apart(*arguments):
     return subprocess.run([sys.executable, "-m", *arguments], capture_output=True, text=True, env=env, timeout=300)
 
 
-SMALL = ("n_envs:8", "n_steps:32", "batch_size:64")
+SMALL = ("n_envs:8", "n_steps:32", "batch_size:64", "learning_rate_floor:0.1")
 ENV = "TargetReaching-v0"
 
 
@@ -81,8 +81,11 @@ def test_training_leaves_the_zoos_files_and_every_metric(logs):
     names = {path.name for path in folder.iterdir()}
     assert {"TargetReaching-v0.zip", "best_model.zip", "evaluations.npz", "progress.csv"} <= names
     with open(folder / "progress.csv") as file:
-        header = next(csv.reader(file))
-    assert {"uspl/uncertainty", "uspl/progress", "encoder/nll", "eval/success_rate", "rollout/success_rate"} <= set(header)
+        rows = list(csv.DictReader(file))
+    expected = {"uspl/uncertainty", "uspl/progress", "encoder/nll", "eval/success_rate", "rollout/success_rate"}
+    assert expected <= set(rows[0])
+    rates = [float(row["train/learning_rate"]) for row in rows if row["train/learning_rate"]]
+    assert 0.1 * rates[0] <= rates[-1] < 0.5 * rates[0]  # the cosine, not a constant of the zoo's
 
 
 def test_evaluation_prints_one_json_object(logs):
@@ -121,7 +124,7 @@ def test_training_is_continued_where_it_ended(logs, tmp_path):
 @pytest.mark.parametrize("algo", ["uspl_ppo", "resel_ppo"])
 def test_optimisation_keeps_the_configurations_networks_and_its_trials_can_be_trained(algo, tmp_path):
     storage = ("--storage", f"sqlite:///{tmp_path}/study.db", "--study-name", "study")
-    trials = ("--n-trials", "2", "--n-startup-trials", "0", "--n-evaluations", "1", "--eval-episodes", "2")
+    trials = ("--n-trials", "2", "--n-startup-trials", "0", "--n-evaluations", "1", "--eval-episodes", "2", "--pruner", "none")
     train(tmp_path, algo, 512, "-optimize", *trials, *storage, "--no-optim-plots", small=("n_envs:8",))
     with open(next((tmp_path / algo).glob("report_*.csv"))) as file:
         _, trial = csv.DictReader(file)  # the zoo takes trial 0 for none
