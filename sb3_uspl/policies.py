@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 from torch import nn
 
+from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, encode_actions, reset_rows
 from sb3_uspl.observations import (
     BELIEF,
@@ -118,6 +119,8 @@ class USPLPolicy(ActorCriticPolicy):
     :param bounded_mean: whether the mean of continuous actions is squashed into the action space by a tanh, as in the authors'
         release. Without it the mean drifts beyond the bounds, where sampling changes nothing any more and a habit of the
         warm-up cannot be unlearned.
+    :param noise_correlation: of the noise of continuous actions from one decision to the next, see
+        ``CorrelatedGaussianDistribution``
     :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
     :param kwargs: further arguments of ``ActorCriticPolicy``
     :raises ValueError: for a space outside the contract or an unknown preset
@@ -141,6 +144,7 @@ class USPLPolicy(ActorCriticPolicy):
         privileged_gain: float = 4.0,
         normalize_common: bool = True,
         bounded_mean: bool = True,
+        noise_correlation: float = 0.0,
         smoothing: float = 0.0,
         **kwargs: Any,
     ):
@@ -152,6 +156,7 @@ class USPLPolicy(ActorCriticPolicy):
             encoder_learning_rate=encoder_learning_rate,
             encoder_weight_decay=encoder_weight_decay,
             bounded_mean=bounded_mean,
+            noise_correlation=noise_correlation,
             smoothing=smoothing,
         )
         self.feature_arguments: dict[str, Any] = dict(
@@ -181,6 +186,8 @@ class USPLPolicy(ActorCriticPolicy):
             self.action_half_range: th.Tensor
             self.register_buffer("action_centre", 0.5 * (high + low).flatten())
             self.register_buffer("action_half_range", 0.5 * (high - low).flatten())
+        if noise_correlation > 0.0 and isinstance(action_space, spaces.Box):
+            self.action_dist = CorrelatedGaussianDistribution(get_flattened_obs_dim(action_space), noise_correlation)
         # Built after super().__init__, whose optimizer must not hold the encoder.
         self.smoothing = smoothing
         n_action = get_flattened_obs_dim(action_space)

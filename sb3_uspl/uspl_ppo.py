@@ -62,6 +62,8 @@ class USPLPPO(PPO):
     :param action_std: initial standard deviation of continuous actions, annealed by a cosine, not learned (Table 4: 0.35;
         Table 5: 0.65). None learns it, as stock PPO does.
     :param action_std_floor: share of ``action_std`` left at the end of training (release: 1/5)
+    :param action_noise_time: time constant in s over which the noise of continuous actions is correlated, so that it finds
+        detours; 0: not at all
     :param warmup_timesteps: decisions before blurring and reward transformation set in (l = 0; C.3.1: 100 epochs). None: 20 %
         of the first ``learn``.
     :param ramp_timesteps: decisions over which the progress coefficient l rises to 1 (C.3.1: 300 epochs). None: 50 % of the
@@ -143,6 +145,7 @@ class USPLPPO(PPO):
         learning_rate_floor: float = 0.05,
         action_std: float | None = 0.35,
         action_std_floor: float = 0.2,
+        action_noise_time: float = 0.0,
         warmup_timesteps: int | None = None,
         ramp_timesteps: int | None = None,
         blur: bool = True,
@@ -215,6 +218,7 @@ class USPLPPO(PPO):
         )
         self.learning_rate_floor = learning_rate_floor
         self.action_std, self.action_std_floor = action_std, action_std_floor
+        self.action_noise_time = action_noise_time
         self.warmup_timesteps, self.ramp_timesteps = warmup_timesteps, ramp_timesteps
         self.blur, self.reward_scaling = blur, reward_scaling
         self.uncertainty_input, self.mean_input = uncertainty_input, mean_input and uncertainty_input
@@ -253,6 +257,7 @@ class USPLPPO(PPO):
             "uncertainty_input": self.uncertainty_input,
             "mean_input": self.mean_input,
             "smoothing": smoothing,
+            "noise_correlation": smoothing_factor(self.action_noise_time, self.decision_period),
             "encoder_learning_rate": self.encoder_lr_schedule(1.0),
             "encoder_weight_decay": self.encoder_weight_decay,
         }
@@ -327,6 +332,7 @@ class USPLPPO(PPO):
             "blur_gain": (self.blur_gain, 0, np.inf),
             "blur_hold_time": (self.blur_hold_time, 0, np.inf),
             "smoothing_time": (self.smoothing_time, 0, np.inf),
+            "action_noise_time": (self.action_noise_time, 0, np.inf),
             "c_max": (self.c_max, 0, np.inf),
             "delta": (self.delta, 0, np.inf),
             "encoder_updates": (self.encoder_updates, 0, np.inf),
