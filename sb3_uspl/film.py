@@ -15,12 +15,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Ellipse, Patch, Polygon, Rectangle
 from PIL import Image
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
 
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Shape
-from sb3_uspl.observations import PRIVILEGED
-from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR, on_map
+from sb3_uspl.chosen_uncertainty import ChosenUncertainty
+from sb3_uspl.observations import PRIVILEGED, TARGET
+from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR, BeliefInWorld, on_map
 from sb3_uspl.policies import DeploymentState, USPLPolicy
+from sb3_uspl.uspl_ppo import PAPER_DECISION_PERIOD
 
 FRAMES_PER_SECOND = 8.0
 """Decisions a second in the film; twice real time for decisions of 0.25 s."""
@@ -28,71 +31,139 @@ FIRST_FRAME_TIME, LAST_FRAME_TIME = 1.0, 2.5
 """s for which the beginning and the end of an episode stand still."""
 GIF_COLOURS = 200
 _WIDTH, _DPI = 10.0, 90
-_ROW_HEIGHT = {True: 4.1, False: 3.7}  # inches an agent, by whether the panels lie one above the other
+_ROW_HEIGHT = {True: 4.6, False: 3.9}  # inches an agent, by whether the panels lie one above the other
 _WIDE = 2.0  # ratio of width to height from which the picture lies above the map instead of beside it
 _PARKED_HEIGHT = -50.0  # m; shapes below are out of use in this episode
 _MARGIN = 0.5  # m around the scene
 _OPEN_FIELD = ((-1.0, -1.0), (1.0, 1.0))  # the map of an environment without a scene, in its own unit
 _LEAST_THICKNESS, _ROBOT_LENGTH = 0.035, 0.045  # share of the map's width
+_CAMERA_INSET = (0.66, 0.66, 0.33, 0.33)  # left, bottom, width and height in shares of the panel
+_CHOSEN_COLOUR = "#D55E00"
+_LEAST_BOUND, _BAR_WIDTH = 0.3, 0.62  # privileged units; share of a dimension's room
 _GROUND, _REACHED, _FAILED, _ERROR_COLOUR = "#3b4452", "#1b7f3b", "#b3261e", "#333333"
 
 
 @dataclass
 class Clip:
-    """One episode of a deployment policy, at every decision and once after the last one."""
+    """One episode of a policy, at every decision and once after the last one."""
 
     seed: int
     scene: SceneSpec | None
-    goal: np.ndarray
-    """On the map, ``(2,)``."""
+    goal: np.ndarray | None
+    """On the map, ``(2,)``; None if the environment has no map."""
+    truth: np.ndarray
+    """Privileged observation at the start, ``(n_privileged,)``."""
+    bounds: np.ndarray
+    """Lower and upper ones of the privileged observation, ``(2, n_privileged)``."""
+    policy: str = "deployment"
+    goal_is_place: bool = True
+    """Whether the task has a goal to go to; else ``goal`` is where the truth lies on the map."""
+    choices: Mapping[int, Sequence[float]] = field(default_factory=dict)
+    """Values of the discrete dimensions of the privileged observation."""
     success: bool = False
     poses: list[tuple[float, float, float]] = field(default_factory=list)
-    """x, y (m) and yaw (rad)."""
+    """x, y (m) and yaw (rad); zeros without a map."""
+    means: list[np.ndarray] = field(default_factory=list)
+    stds: list[np.ndarray] = field(default_factory=list)
+    """The belief, ``(n_privileged,)``."""
+    chosen: list[float | None] = field(default_factory=list)
+    """Uncertainty that the policy was shown in place of the encoder's, to the scale of ``sigmas``."""
     centres: list[np.ndarray] = field(default_factory=list)
     half_widths: list[np.ndarray] = field(default_factory=list)
     sigmas: list[float] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
     pictures: list[np.ndarray] = field(default_factory=list)
     """Of ``env.render()``; empty if the environment gives none."""
+    views: list[np.ndarray] = field(default_factory=list)
+    """Of the robot's camera, uint8 ``(height, width)``; empty if it has none."""
 
 
-def record_clip(model: BaseAlgorithm, env: gym.Env, seed: int) -> Clip:
+def record_clip(
+    model: BaseAlgorithm,
+    env: gym.Env,
+    seed: int,
+    uncertainty: ChosenUncertainty | None = None,
+    policy: str = "deployment",
+) -> Clip:
     """
-    Run one episode of the deployment policy, deterministic.
+    Run one episode, deterministic.
 
     :param model: with a ``USPLPolicy``
-    :param env: with ``belief_in_world``, itself or its task
+    :param env: with ``belief_in_world``, itself or its task, for a map; without, everything is in privileged units
     :param seed: of the episode
+    :param uncertainty: shown to the policy in place of the encoder's
+    :param policy: "deployment", or "privileged": the policy is shown the truth in place of the belief's mean, as in Fig. 7
     :return: the episode
-    :raises ValueError: if the model has no belief
+    :raises ValueError: for an unknown policy, or if the model has no belief
     """
-    policy = model.policy
+    network = model.policy
     world: Any = env.unwrapped
-    if not isinstance(policy, USPLPolicy):
+    if not isinstance(network, USPLPolicy):
         raise ValueError(f"{type(model).__name__} has no observation encoder, so there is no belief to film.")
-    task = getattr(world, "task", world)
+    if policy not in ("deployment", "privileged"):
+        raise ValueError(f"policy='{policy}': choose 'deployment' or 'privileged'.")
+    belief_in_world = map_of(env)
+    period = decision_period_of(env)
     obs, info = env.reset(seed=seed)
-    goal = task.goal if hasattr(task, "goal") else task.belief_in_world(obs[PRIVILEGED], np.zeros_like(obs[PRIVILEGED]))[0]
-    clip = Clip(seed, getattr(world, "scene", None), np.asarray(goal))
+    clip = _new_clip(env, seed, obs[PRIVILEGED], policy)
+    has_camera = TARGET in obs and is_image_space(env.observation_space[TARGET])  # type: ignore[index]
     state: DeploymentState | None = None
     over = False
     while True:
-        action, state = policy.act(obs, state, deterministic=True)  # type: ignore[arg-type]
-        centre, half_widths, sigma, error = on_map(
-            task.belief_in_world, state.belief_mean[0], state.uncertainty[0], obs[PRIVILEGED]
-        )
-        clip.poses.append(_pose(world, info, clip.poses))
+        chosen = None if uncertainty is None else uncertainty.at(len(clip.means), period)
+        shown = obs[PRIVILEGED][None] if policy == "privileged" else None
+        action, state = network.act(obs, state, deterministic=True, privileged=shown, uncertainty=chosen)  # type: ignore[arg-type]
+        mean, std = state.belief_mean[0], state.uncertainty[0]
+        centre, half_widths, sigma, error = on_map(belief_in_world, mean, std, obs[PRIVILEGED])
+        level = None if chosen is None else on_map(belief_in_world, mean, np.full_like(std, chosen), obs[PRIVILEGED])[2]
+        clip.poses.append((0.0, 0.0, 0.0) if clip.goal is None else _pose(world, info, clip.poses))
+        clip.means.append(mean)
+        clip.stds.append(std)
+        clip.chosen.append(level)
         clip.centres.append(centre)
         clip.half_widths.append(half_widths)
         clip.sigmas.append(sigma)
         clip.errors.append(error)
         if env.render_mode == "rgb_array":
             clip.pictures.append(env.render())  # type: ignore[arg-type]
+        if has_camera:
+            clip.views.append(obs[TARGET][0].copy())
         if over:
             clip.success = bool(info.get("is_success", False))
             return clip
         obs, _, terminated, truncated, info = env.step(action)
         over = terminated or truncated
+
+
+def map_of(env: gym.Env) -> BeliefInWorld:
+    """
+    :param env: environment
+    :return: its ``belief_in_world`` or its task's; without one, a belief is itself
+    """
+    world: Any = env.unwrapped
+    return getattr(getattr(world, "task", world), "belief_in_world", lambda mean, std: (np.asarray(mean), np.asarray(std)))
+
+
+def decision_period_of(env: gym.Env) -> float:
+    """
+    :param env: environment
+    :return: s per decision; 20 ms, the paper's, if it does not say
+    """
+    return float(env.get_wrapper_attr("decision_period")) if env.has_wrapper_attr("decision_period") else PAPER_DECISION_PERIOD
+
+
+def _new_clip(env: gym.Env, seed: int, truth: np.ndarray, policy: str) -> Clip:
+    world: Any = env.unwrapped
+    task = getattr(world, "task", world)
+    space: Any = env.observation_space
+    goal = None
+    if hasattr(task, "belief_in_world"):
+        goal = np.asarray(task.goal if hasattr(task, "goal") else task.belief_in_world(truth, np.zeros_like(truth))[0])
+    choices = env.get_wrapper_attr("discrete_privileged") if env.has_wrapper_attr("discrete_privileged") else {}
+    bounds = np.stack([space[PRIVILEGED].low, space[PRIVILEGED].high])
+    return Clip(
+        seed, getattr(world, "scene", None), goal, truth.copy(), bounds, policy, hasattr(task, "goal"), dict(choices or {})
+    )
 
 
 def _pose(world: Any, info: dict[str, Any], before: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
@@ -105,16 +176,25 @@ def _pose(world: Any, info: dict[str, Any], before: Sequence[tuple[float, float,
     return x, y, math.atan2(y - before[-1][1], x - before[-1][0])
 
 
-def film(agents: Mapping[str, BaseAlgorithm], env: gym.Env, seeds: Sequence[int], out: Path) -> list[Clip]:
+def film(
+    agents: Mapping[str, BaseAlgorithm],
+    env: gym.Env,
+    seeds: Sequence[int],
+    out: Path,
+    uncertainty: ChosenUncertainty | None = None,
+    policy: str = "deployment",
+) -> list[Clip]:
     """
-    Film the deployment policies of one or several agents, one above the other, on the same episodes.
+    Film the policies of one or several agents, one above the other, on the same episodes.
 
     An episode of n decisions gives n + 1 frames; if one agent is done earlier its last frame stays until the others are.
 
     :param agents: models with a ``USPLPolicy``, by the name to show
-    :param env: with ``belief_in_world``; made with ``render_mode="rgb_array"`` its picture is shown as well
+    :param env: with ``belief_in_world`` a map is shown, made with ``render_mode="rgb_array"`` its picture as well
     :param seeds: of the episodes, shown one after the other
     :param out: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg)
+    :param uncertainty: shown to the policies in place of their encoders'
+    :param policy: "deployment" or "privileged", see :func:`record_clip`
     :return: the episodes: for each seed those of all agents
     :raises ValueError: for another file type, without an agent or seed, or if an agent has no belief
     """
@@ -122,16 +202,17 @@ def film(agents: Mapping[str, BaseAlgorithm], env: gym.Env, seeds: Sequence[int]
         raise ValueError(f"{out}: a film is a .gif or a .mp4 file.")
     if not agents or not seeds:
         raise ValueError("A film needs at least one agent and one seed.")
-    period = float(env.get_wrapper_attr("decision_period"))
+    period = decision_period_of(env)
     frames: list[np.ndarray] = []
     times: list[float] = []
     recorded: list[Clip] = []
     for seed in seeds:
-        clips = {name: record_clip(model, env, seed) for name, model in agents.items()}
+        clips = {name: record_clip(model, env, seed, uncertainty, policy) for name, model in agents.items()}
         episode = list(_draw(clips, period))
         frames += episode
         times += [FIRST_FRAME_TIME, *([1.0 / FRAMES_PER_SECOND] * (len(episode) - 2)), LAST_FRAME_TIME]
         recorded += clips.values()
+    out.parent.mkdir(parents=True, exist_ok=True)
     (_write_gif if out.suffix == ".gif" else _write_mp4)(frames, times, out)
     return recorded
 
@@ -143,7 +224,8 @@ def _draw(clips: Mapping[str, Clip], period: float) -> Iterator[np.ndarray]:
     figure = Figure(figsize=(_WIDTH, _ROW_HEIGHT[ratio > _WIDE] * len(clips)), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     end = period * max(len(clip.poses) - 1 for clip in clips.values())
-    highest = 1.15 * max(max(clip.sigmas + clip.errors) for clip in clips.values())
+    levels = [value for clip in clips.values() for value in (*clip.sigmas, *clip.errors, *clip.chosen) if value is not None]
+    highest = 1.15 * max(levels)
     rows = figure.subfigures(len(clips), 1, squeeze=False)[:, 0]
     stages = [
         _Stage(row, name, clip, period, (end, highest), ratio > _WIDE)
@@ -161,7 +243,7 @@ def _draw(clips: Mapping[str, Clip], period: float) -> Iterator[np.ndarray]:
 
 class _Stage:
     """
-    The panels of one agent: picture, map and belief over time.
+    The panels of one agent: picture, map, belief over time and belief as bars.
 
     :param row: where to draw
     :param name: of the agent
@@ -173,19 +255,26 @@ class _Stage:
 
     def __init__(self, row: SubFigure, name: str, clip: Clip, period: float, limits: tuple[float, float], wide: bool):
         self.row, self.name, self.clip, self.period = row, name, clip, period
-        shown = ("picture", "map") if clip.pictures else ("map",)
-        layout = [[panel, "time"] for panel in shown] if wide else [[*shown, "time"]]
-        ratios = (2.6, 1.0) if wide else [1.0] * len(layout[0])
+        shown = [panel for panel, there in (("picture", clip.pictures), ("map", clip.goal is not None)) if there]
+        layout, ratios = [[*shown, "time"], [*shown, "bars"]], [1.0] * (len(shown) + 1)
+        if wide and len(shown) == 2:
+            layout, ratios = [[shown[0], "time"], [shown[1], "bars"]], [2.6, 1.0]
         axes = row.subplot_mosaic(layout, width_ratios=ratios)  # type: ignore[arg-type]
         self.title = row.suptitle(" ", fontweight="bold", fontsize="large")
         if clip.pictures:
             axes["picture"].set_axis_off()
             self.image = axes["picture"].imshow(clip.pictures[0])
-        self._draw_map(axes["map"])
+        if clip.goal is not None:
+            self._draw_map(axes["map"], clip.goal)
+        if clip.views:
+            inset = axes[shown[0] if shown else "bars"].inset_axes(_CAMERA_INSET, xticks=[], yticks=[])
+            inset.set_title("its camera", fontsize="x-small", pad=2.0)
+            self.view = inset.imshow(clip.views[0], cmap="gray", vmin=0, vmax=255)
         self._draw_time(axes["time"], limits)
+        self._draw_bars(axes["bars"])
 
-    def _draw_map(self, axis: Axes) -> None:
-        scene, unit = self.clip.scene, "" if self.clip.scene is None else " (m)"
+    def _draw_map(self, axis: Axes, goal: np.ndarray) -> None:
+        scene, unit = self.clip.scene, self._unit
         shapes = [shape for shape in scene.shapes if shape.top > _PARKED_HEIGHT] if scene is not None else []
         for shape in sorted(shapes, key=lambda shape: shape.top):
             axis.add_patch(_footprint(shape))
@@ -201,11 +290,12 @@ class _Stage:
         self.robot = Polygon(np.zeros((3, 2)), facecolor=DEPLOYMENT_COLOUR, edgecolor="white", linewidth=1.0, zorder=6)
         axis.add_patch(self.robot)
         star = dict(marker="*", markersize=15, color="gold", markeredgecolor="black", linestyle="")
-        axis.plot(*self.clip.goal, zorder=5, **star)  # type: ignore[arg-type]
+        axis.plot(*goal, zorder=5, **star)  # type: ignore[arg-type]
+        hidden = "goal" if self.clip.goal_is_place else "truth"
         handles = [
             Line2D([], [], marker=">", color=DEPLOYMENT_COLOUR, markersize=8, label="robot and its path"),
-            Line2D([], [], label="goal (hidden from it)", **star),  # type: ignore[arg-type]
-            Patch(color=SIGMA_COLOUR, alpha=0.55, label="where it believes the goal is (±1 $\\sigma$)"),
+            Line2D([], [], label=hidden + " (hidden)", **star),  # type: ignore[arg-type]
+            Patch(color=SIGMA_COLOUR, alpha=0.55, label="belief, ±1 $\\sigma$"),
         ]
         axis.legend(
             handles=handles, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small", frameon=False,
@@ -213,13 +303,38 @@ class _Stage:
         )  # fmt: skip
 
     def _draw_time(self, axis: Axes, limits: tuple[float, float]) -> None:
-        unit = "" if self.clip.scene is None else " (m)"
         (self.sigma,) = axis.plot([], [], color=SIGMA_COLOUR, linewidth=2.2, label=r"uncertainty $\sigma$")
         (self.error,) = axis.plot([], [], "--", color=_ERROR_COLOUR, linewidth=1.6, label="|belief - truth|")
+        self.chosen = None
+        if any(level is not None for level in self.clip.chosen):
+            (self.chosen,) = axis.plot([], [], color=_CHOSEN_COLOUR, drawstyle="steps-post", label=r"$\sigma$ it was shown")
         self.now = axis.axvline(0.0, color="0.6", linewidth=1.0)
-        axis.set(xlim=(0.0, max(limits[0], self.period)), ylim=(0.0, limits[1]), xlabel="time (s)", ylabel="belief" + unit)
-        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False)
+        axis.set(
+            xlim=(0.0, max(limits[0], self.period)), ylim=(0.0, limits[1]), xlabel="time (s)", ylabel="belief" + self._unit
+        )
+        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False, ncols=2, columnspacing=1.0)
         axis.grid(alpha=0.25)
+
+    @property
+    def _unit(self) -> str:
+        return " (m)" if self.clip.scene is not None and self.clip.goal is not None else ""
+
+    def _draw_bars(self, axis: Axes) -> None:
+        """The whole belief, dimension by dimension: what has no place on a map, too."""
+        clip = self.clip
+        places = np.arange(1, len(clip.truth) + 1)
+        finite = clip.bounds[np.isfinite(clip.bounds)]
+        reach = np.concatenate([np.abs(clip.truth), np.abs(clip.means).ravel(), np.abs(finite)])
+        limit = 1.15 * max(float(reach.max()), _LEAST_BOUND)
+        for dimension, values in clip.choices.items():
+            axis.hlines(values, dimension + 1 - 0.5 * _BAR_WIDTH, dimension + 1 + 0.5 * _BAR_WIDTH, color="0.7", linestyle=":")
+        self.spread = axis.bar(places, 0.0, _BAR_WIDTH, color=SIGMA_COLOUR, alpha=0.45, label="belief, ±1 $\\sigma$")
+        (self.mean,) = axis.plot(places, places * 0.0, "_", color=SIGMA_COLOUR, markersize=16, markeredgewidth=2.5)
+        axis.plot(places, clip.truth, "D", color="gold", markeredgecolor="black", markersize=6, label="truth (hidden)")
+        axis.set(xlim=(0.3, len(places) + 0.7), ylim=(-limit, limit), xticks=places, ylabel="privileged units")
+        axis.set_xlabel("dimension of the privileged observation", fontsize="small")
+        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False, ncols=2, columnspacing=1.0)
+        axis.grid(axis="y", alpha=0.25)
 
     def show(self, frame: int) -> None:
         """
@@ -231,6 +346,27 @@ class _Stage:
         now = min(frame, last)
         if clip.pictures:
             self.image.set_data(clip.pictures[now])
+        if clip.views:
+            self.view.set_data(clip.views[now])
+        if clip.goal is not None:
+            self._show_on_map(now)
+        time = self.period * np.arange(now + 1)
+        self.sigma.set_data(time, clip.sigmas[: now + 1])
+        self.error.set_data(time, clip.errors[: now + 1])
+        if self.chosen is not None:
+            self.chosen.set_data(time, [np.nan if level is None else level for level in clip.chosen[: now + 1]])
+        self.now.set_xdata([time[-1], time[-1]])
+        for bar, mean, std in zip(self.spread, clip.means[now], clip.stds[now], strict=True):
+            bar.set(y=float(mean - std), height=float(2.0 * std))
+        self.mean.set_ydata(clip.means[now])
+        succeeded = "reached the goal" if clip.goal_is_place else "succeeded"
+        outcome, colour = (succeeded, _REACHED) if clip.success else ("failed", _FAILED)
+        text = f"{outcome} after" if now == last else "running,"
+        self.title.set_text(f"{self.name}, {clip.policy} policy, seed {clip.seed}: {text} {time[-1]:.1f} s")
+        self.title.set_color(colour if now == last else "black")
+
+    def _show_on_map(self, now: int) -> None:
+        clip = self.clip
         x, y, yaw = clip.poses[now]
         self.path.set_data(*np.array(clip.poses[: now + 1])[:, :2].T)
         length = _ROBOT_LENGTH * self.size
@@ -240,14 +376,6 @@ class _Stage:
         self.belief.set_center(tuple(clip.centres[now]))
         thickness = _LEAST_THICKNESS * self.size
         self.belief.width, self.belief.height = (max(2.0 * float(half), thickness) for half in clip.half_widths[now])
-        time = self.period * np.arange(now + 1)
-        self.sigma.set_data(time, clip.sigmas[: now + 1])
-        self.error.set_data(time, clip.errors[: now + 1])
-        self.now.set_xdata([time[-1], time[-1]])
-        outcome, colour = ("reached the goal", _REACHED) if clip.success else ("failed", _FAILED)
-        text = f"{outcome} after" if now == last else "running,"
-        self.title.set_text(f"{self.name}, deployment policy, seed {clip.seed}: {text} {time[-1]:.1f} s")
-        self.title.set_color(colour if now == last else "black")
 
 
 def _footprint(shape: Shape) -> Patch:
