@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-slow benchmark benchmark-learning notebooks lint format type check clean
+.PHONY: demo test test-slow docs benchmark benchmark-learning notebooks lint format type check clean
 
 $(INSTALLED): setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v < (3, 12) else "Python %d.%d was found, but PyBullet 3.2.7 has wheels up to Python 3.11 only: install Python 3.10 or 3.11 and run `make PYTHON=python3.11 ...`" % v)'
@@ -36,6 +36,11 @@ NOTEBOOKS ?= $(wildcard notebooks/*.py)
 notebooks: $(INSTALLED)
 	$(BIN)/pip install -q -c constraints.txt --no-build-isolation -e ".[zoo,dev,notebooks]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m jupytext --to ipynb --execute --set-kernel python3 $(NOTEBOOKS)
+
+# The site, into build/docs; a warning is an error.
+docs: $(INSTALLED)
+	$(BIN)/pip install -q -c constraints.txt --no-build-isolation -e ".[zoo,docs]"
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
