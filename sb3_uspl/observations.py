@@ -22,7 +22,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 COMMON, TARGET, PRIVILEGED = "common", "target", "privileged"
 TRUTH, UNCERTAINTY, BELIEF = "truth", "uncertainty", "belief"
-PREVIOUS_ACTION, EPISODE_STEP = "previous_action", "episode_step"
+PREVIOUS_ACTION, EPISODE_STEP, WANDERING = "previous_action", "episode_step", "wandering"
 
 POLICY_KEYS = (COMMON, PRIVILEGED, TRUTH, UNCERTAINTY, BELIEF)
 """What PPO's networks and rollout buffer hold; the encoder's inputs (``target``, previous actions) never reach them."""

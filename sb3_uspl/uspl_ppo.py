@@ -88,6 +88,8 @@ class USPLPPO(PPO):
         privileged observation, spread over the environments. None: once a rollout (release).
     :param wander_share: share of time in which a mismatched environment repeats a random action of its own, so that the
         encoder sees what the policy does not look at yet (0 in the release)
+    :param wander_share_matched: the same for the other environments. PPO leaves such decisions out and goes on from where they
+        lead, so that it learns what being informed is worth before it has found the way there.
     :param wander_time: least and greatest length of such a stretch in s
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
     :param replay_bytes: memory budget of the episode replay
@@ -164,6 +166,7 @@ class USPLPPO(PPO):
         mismatch_fraction: float | None = None,
         mismatch_hold_time: tuple[float, float] | None = None,
         wander_share: float = 0.0,
+        wander_share_matched: float = 0.0,
         wander_time: tuple[float, float] = (0.5, 5.0),
         replay: str = "mismatched",
         replay_bytes: int = 256_000_000,
@@ -228,7 +231,7 @@ class USPLPPO(PPO):
         self.smoothing_time, self.decision_period = smoothing_time, decision_period
         self.mismatch_fraction = mismatch_fraction
         self.mismatch_hold_time = mismatch_hold_time
-        self.wander_share, self.wander_time = wander_share, wander_time
+        self.wander_share, self.wander_share_matched, self.wander_time = wander_share, wander_share_matched, wander_time
         self.replay, self.replay_bytes = replay, replay_bytes
         self.encoder_learning_rate = encoder_learning_rate
         self.encoder_weight_decay = encoder_weight_decay
@@ -295,6 +298,7 @@ class USPLPPO(PPO):
             n_mismatched=self.n_mismatched,
             mismatch_hold=self._in_decisions("mismatch_hold_time"),
             wander_share=self.wander_share,
+            wander_share_matched=self.wander_share_matched,
             wander_hold=self._in_decisions("wander_time") or (1.0, 1.0),
         )
         self._rollout_env = None
@@ -340,6 +344,7 @@ class USPLPPO(PPO):
             "context_length": (self.context_length, 1, np.inf),
             "action_std": (1.0 if self.action_std is None else self.action_std, 1e-6, np.inf),
             "encoder_beta": (self.encoder_beta, 0, 1),
+            "wander_share_matched": (self.wander_share_matched, 0, 1),
             "wander_share": (self.wander_share, 0, 1),
             "mismatch_fraction": (self.mismatch_fraction or 0.0, 0, 0.9),
             "decision_period": (1.0 if self.decision_period is None else self.decision_period, 1e-6, np.inf),

@@ -23,6 +23,7 @@ from sb3_uspl.observations import (
     TARGET,
     TRUTH,
     UNCERTAINTY,
+    WANDERING,
     check_finite,
 )
 from sb3_uspl.uncertainty import (
@@ -54,6 +55,7 @@ class UncertaintyConfig:
     n_mismatched: int = 0
     mismatch_hold: tuple[float, float] | None = None
     wander_share: float = 0.0
+    wander_share_matched: float = 0.0
     wander_hold: tuple[float, float] = (1.0, 1.0)
 
 
@@ -100,35 +102,36 @@ class Wandering:
     are log-uniform; a continuous action is drawn around the middle of its range, often close to it: each dimension's spread is
     drawn anew.
 
-    :param n_envs: number of environments
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary
-    :param share: of time that is spent wandering
+    :param share: of time that each environment spends wandering, ``(n_envs,)``
     :param hold: least and greatest length of a stretch in decisions
     :param rng: random generator
     """
 
-    def __init__(
-        self, n_envs: int, action_space: spaces.Space, share: float, hold: tuple[float, float], rng: np.random.Generator
-    ):
+    def __init__(self, action_space: spaces.Space, share: np.ndarray, hold: tuple[float, float], rng: np.random.Generator):
         self.action_space, self.share, self.rng = action_space, share, rng
         self.log_hold = math.log(hold[0]), math.log(hold[1])
-        self.left = np.zeros(n_envs, dtype=np.int64)
-        self.wandering = np.zeros(n_envs, dtype=bool)
-        self.actions = np.stack([action_space.sample() for _ in range(n_envs)])
+        self.left = np.zeros(len(share), dtype=np.int64)
+        self.active = np.zeros(len(share), dtype=bool)
+        """Which environments will not take the policy's next action."""
+        self.actions = np.stack([action_space.sample() for _ in share])
 
-    def apply(self, actions: np.ndarray) -> np.ndarray:
+    def advance(self) -> None:
+        """Draw who wanders at the next decision."""
+        self.left -= 1
+        due = np.flatnonzero(self.left <= 0)
+        self.left[due] = np.ceil(np.exp(self.rng.uniform(self.log_hold[0], self.log_hold[1], len(due)))).astype(np.int64)
+        self.active[due] = self.rng.uniform(size=len(due)) < self.share[due]
+        for row in due[self.active[due]]:
+            self.actions[row] = self._draw()
+
+    def replace(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: the policy's, ``(n_envs, ...)``
         :return: those that are taken
         """
-        due = np.flatnonzero(self.left == 0)
-        self.left[due] = np.ceil(np.exp(self.rng.uniform(self.log_hold[0], self.log_hold[1], len(due)))).astype(np.int64)
-        self.left -= 1
-        self.wandering[due] = self.rng.uniform(size=len(due)) < self.share
-        for row in due[self.wandering[due]]:
-            self.actions[row] = self._draw()
-        shape = (len(actions), *[1] * (actions.ndim - 1))
-        return np.where(self.wandering.reshape(shape), self.actions, actions).astype(actions.dtype)
+        active = self.active.reshape(-1, *[1] * (actions.ndim - 1))
+        return np.where(active, self.actions, actions).astype(actions.dtype)
 
     def _draw(self) -> Any:
         space = self.action_space
@@ -149,6 +152,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations; with
     ``mismatch_hold``, each draws another one after a random time, whose mean is spread log-uniformly over that range, so that
     the encoder sees the behaviour of the undecided and of those who change their mind before the policy has learned either.
+    Where environments wander, ``wandering`` tells which of them will not take the next action.
 
     :param venv: environments under the observation contract
     :param encoder: observation encoder
@@ -170,11 +174,8 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self._matched = np.arange(self.num_envs) < self.num_envs - config.n_mismatched
         if config.mismatch_hold is not None:
             self._redraw_rate = 1.0 / np.geomspace(*config.mismatch_hold, config.n_mismatched)
-        self._wandering: Wandering | None = None
-        if config.wander_share > 0.0 and config.n_mismatched > 0:
-            self._wandering = Wandering(
-                config.n_mismatched, venv.action_space, config.wander_share, config.wander_hold, self.rng
-            )
+        share = np.where(self._matched, config.wander_share_matched, config.wander_share)
+        self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng) if share.any() else None
 
     def reset(self) -> VecEnvObs:
         return self.begin(self.venv.reset())  # type: ignore[arg-type]
@@ -210,8 +211,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
 
     def step_async(self, actions: np.ndarray) -> None:
         if self._wandering is not None:
-            first = self.num_envs - self.config.n_mismatched
-            actions = np.concatenate((actions[:first], self._wandering.apply(actions[first:])))
+            actions = self._wandering.replace(actions)
         self.previous_action = encode_actions(actions, self.action_space)
         self.venv.step_async(actions)
 
@@ -261,6 +261,9 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         out |= {PREVIOUS_ACTION: self.previous_action, EPISODE_STEP: self.step_count.copy()}
         if TARGET in obs:
             out[TARGET] = obs[TARGET]
+        if self._wandering is not None:
+            self._wandering.advance()
+            out[WANDERING] = self._wandering.active.copy()
         matched = self._matched
         self.metrics["uncertainty"].append(float(self.std[matched].mean()))
         self.metrics["prediction_error"].append(float(np.abs(mean - obs[PRIVILEGED])[matched].mean()))
