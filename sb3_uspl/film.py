@@ -39,7 +39,7 @@ _OPEN_FIELD = ((-1.0, -1.0), (1.0, 1.0))  # the map of an environment without a 
 _LEAST_THICKNESS, _ROBOT_LENGTH = 0.035, 0.045  # share of the map's width
 _CAMERA_INSET = (0.66, 0.66, 0.33, 0.33)  # left, bottom, width and height in shares of the panel
 _CHOSEN_COLOUR = "#D55E00"
-_LEAST_BOUND, _BAR_WIDTH = 0.3, 0.62  # privileged units; share of a dimension's room
+_LEAST_BOUND, _GREATEST_BOUND, _BAR_WIDTH = 0.3, 2.0, 0.62  # privileged units; times the values; share of a dimension's room
 _GROUND, _REACHED, _FAILED, _ERROR_COLOUR = "#3b4452", "#1b7f3b", "#b3261e", "#333333"
 
 
@@ -256,7 +256,7 @@ class _Stage:
     def __init__(self, row: SubFigure, name: str, clip: Clip, period: float, limits: tuple[float, float], wide: bool):
         self.row, self.name, self.clip, self.period = row, name, clip, period
         shown = [panel for panel, there in (("picture", clip.pictures), ("map", clip.goal is not None)) if there]
-        layout, ratios = [[*shown, "time"], [*shown, "bars"]], [1.0] * (len(shown) + 1)
+        layout, ratios = [[*shown, "time"], [*shown, "bars"]], [1.25, 1.0, 0.85][-len(shown) - 1 :]
         if wide and len(shown) == 2:
             layout, ratios = [[shown[0], "time"], [shown[1], "bars"]], [2.6, 1.0]
         axes = row.subplot_mosaic(layout, width_ratios=ratios)  # type: ignore[arg-type]
@@ -282,6 +282,8 @@ class _Stage:
             axis.set_facecolor(_GROUND)
         corners = np.array([_extent(shape) for shape in shapes]) if shapes else np.array([_OPEN_FIELD])
         (left, bottom), (right, top) = corners[:, 0].min(axis=0) - _MARGIN, corners[:, 1].max(axis=0) + _MARGIN
+        if shapes and not self.clip.goal_is_place:
+            (left, bottom), (right, top) = self._where_it_happens(goal)
         axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x" + unit, ylabel="y" + unit)
         self.size = right - left
         self.belief = Ellipse((0.0, 0.0), 1.0, 1.0, facecolor=SIGMA_COLOUR, edgecolor=SIGMA_COLOUR, alpha=0.55, linewidth=2.0)
@@ -302,17 +304,26 @@ class _Stage:
             columnspacing=1.2, handletextpad=0.5,
         )  # fmt: skip
 
+    def _where_it_happens(self, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Square around path and beliefs: without a goal to go to, a scene may be a hundred times as wide as what happens."""
+        clip = self.clip
+        centres, half_widths = np.stack(clip.centres), np.stack(clip.half_widths)
+        points = np.concatenate([np.array(clip.poses)[:, :2], goal[None], centres - half_widths, centres + half_widths])
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = 0.6 * float((high - low).max())
+        return 0.5 * (low + high) - half, 0.5 * (low + high) + half
+
     def _draw_time(self, axis: Axes, limits: tuple[float, float]) -> None:
-        (self.sigma,) = axis.plot([], [], color=SIGMA_COLOUR, linewidth=2.2, label=r"uncertainty $\sigma$")
+        (self.sigma,) = axis.plot([], [], color=SIGMA_COLOUR, linewidth=2.2, label=r"$\sigma$")
         (self.error,) = axis.plot([], [], "--", color=_ERROR_COLOUR, linewidth=1.6, label="|belief - truth|")
         self.chosen = None
         if any(level is not None for level in self.clip.chosen):
-            (self.chosen,) = axis.plot([], [], color=_CHOSEN_COLOUR, drawstyle="steps-post", label=r"$\sigma$ it was shown")
+            (self.chosen,) = axis.plot([], [], color=_CHOSEN_COLOUR, drawstyle="steps-post", label=r"$\sigma$ shown")
         self.now = axis.axvline(0.0, color="0.6", linewidth=1.0)
         axis.set(
             xlim=(0.0, max(limits[0], self.period)), ylim=(0.0, limits[1]), xlabel="time (s)", ylabel="belief" + self._unit
         )
-        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False, ncols=2, columnspacing=1.0)
+        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False, ncols=3, columnspacing=0.8)
         axis.grid(alpha=0.25)
 
     @property
@@ -324,8 +335,9 @@ class _Stage:
         clip = self.clip
         places = np.arange(1, len(clip.truth) + 1)
         finite = clip.bounds[np.isfinite(clip.bounds)]
-        reach = np.concatenate([np.abs(clip.truth), np.abs(clip.means).ravel(), np.abs(finite)])
-        limit = 1.15 * max(float(reach.max()), _LEAST_BOUND)
+        reach = max(float(np.abs(part).max(initial=0.0)) for part in (clip.truth, np.array(clip.means), finite))
+        widest = float((np.abs(clip.means) + clip.stds).max())
+        limit = 1.1 * max(reach, _LEAST_BOUND, min(widest, _GREATEST_BOUND * max(reach, _LEAST_BOUND)))
         for dimension, values in clip.choices.items():
             axis.hlines(values, dimension + 1 - 0.5 * _BAR_WIDTH, dimension + 1 + 0.5 * _BAR_WIDTH, color="0.7", linestyle=":")
         self.spread = axis.bar(places, 0.0, _BAR_WIDTH, color=SIGMA_COLOUR, alpha=0.45, label="belief, ±1 $\\sigma$")
@@ -333,7 +345,7 @@ class _Stage:
         axis.plot(places, clip.truth, "D", color="gold", markeredgecolor="black", markersize=6, label="truth (hidden)")
         axis.set(xlim=(0.3, len(places) + 0.7), ylim=(-limit, limit), xticks=places, ylabel="privileged units")
         axis.set_xlabel("dimension of the privileged observation", fontsize="small")
-        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False, ncols=2, columnspacing=1.0)
+        axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize="small", frameon=False, ncols=3, columnspacing=0.8)
         axis.grid(axis="y", alpha=0.25)
 
     def show(self, frame: int) -> None:

@@ -105,6 +105,7 @@ def page_data(clip: Clip, heights: Sequence[float], views: Sequence[np.ndarray],
     :param period: s per decision
     :return: what the page's script reads, ready for JSON
     """
+    assert clip.goal is not None, "write_replay refuses an environment without a map"
     points, triangles, colours = scene_mesh(clip.scene)
     path = np.array([(x, y, z, yaw) for (x, y, yaw), z in zip(clip.poses, heights, strict=True)])
     around = np.concatenate([points, path[:, :3]]) if len(points) else path[:, :3]

@@ -19,7 +19,7 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("**/*.md"))]
 ALGORITHMS = {"uspl_ppo": USPLPPO, "rma": RMA, "rewreg": RewReg, "privrecons": PrivRecons, "resel_ppo": RESeLPPO}
 TINY = {
-    "train": "-n 128 --eval-freq -1 -params n_envs:4 n_steps:16 batch_size:32".split(),
+    "train": "-n 128 --eval-freq 64 --eval-episodes 1 -params n_envs:4 n_steps:16 batch_size:32".split(),
     "evaluate": "--episodes 2 --n-envs 2".split(),
 }
 PREAMBLE = "import gymnasium, gymnasium as gym, bullet_tasks, my_module\n"
