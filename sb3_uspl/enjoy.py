@@ -1,5 +1,7 @@
 """``python -m sb3_uspl.enjoy``: the zoo's viewer with our algorithms; ``--film`` and ``--replay`` write what it would show."""
 
+from gymnasium.error import DependencyNotInstalled
+
 from sb3_uspl import _episode
 from sb3_uspl._zoo import check_command_line, register, use_default_folder
 
@@ -10,8 +12,9 @@ def watch() -> None:
 
     try:
         enjoy()
-    except (RuntimeError, ValueError) as error:
-        if "render_mode" not in str(error):
+    except (DependencyNotInstalled, RuntimeError, ValueError) as error:
+        # pygame, which Gymnasium takes for environments without a window of their own, speaks of its "video device".
+        if not isinstance(error, DependencyNotInstalled) and not any(word in str(error) for word in ("render_mode", "video")):
             raise
         raise SystemExit(
             f"{error}\nWithout a window: --no-render counts successes; --film FILE.mp4 and --replay FILE.html show episodes."

@@ -150,6 +150,25 @@ def test_record_video_writes_a_film(logs, tmp_path):
     assert next(tmp_path.glob("*.mp4")).stat().st_size > 1000
 
 
+def test_films_of_what_the_robot_believes_under_a_chosen_uncertainty(logs, tmp_path):
+    pytest.importorskip("matplotlib")
+    where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(logs))
+    (tmp_path / "schedule.csv").write_text("decisions,sigma\n0,0.3\n5,\n")
+    chosen = ("--uncertainty", str(tmp_path / "schedule.csv"), "--policy", "privileged")
+    result = run("sb3_uspl.record_video", *where, "--film", str(tmp_path / "a.gif"), *chosen)
+    assert result.returncode == 0 and (tmp_path / "a.gif").stat().st_size > 10_000, result.stderr
+    result = run("sb3_uspl.enjoy", *where, "--film", str(tmp_path / "b.gif"), "--uncertainty", "high")
+    assert result.returncode != 0 and "expected a number" in result.stderr and "Traceback" not in result.stderr
+    result = run("sb3_uspl.enjoy", *where, "--replay", str(tmp_path / "b.html"), "--uncertainty", "0.3")
+    assert result.returncode != 0 and "for films" in result.stderr
+
+
+def test_a_missing_window_is_explained(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    result = run("sb3_uspl.enjoy", "--algo", "uspl_ppo", "--env", "LateralChoice-v0")
+    assert result.returncode != 0 and "needs a display" in result.stderr and "--film FILE.mp4" in result.stderr
+
+
 def test_training_success_can_be_plotted(logs, monkeypatch):
     """The zoo only shows its plot; what it drew is read from the figure."""
     plot_train = pytest.importorskip("rl_zoo3.plots.plot_train")
