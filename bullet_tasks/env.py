@@ -27,8 +27,8 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     Robot x task x sensors.
 
     Observations are a dict of ``common``, ``privileged`` and, if there is a sensor, ``target``. ``info`` holds
-    ``is_success`` (bool), ``position`` (float32 ``(2,)``, m), ``reward_terms`` (name -> float, their sum is the reward) and, after a
-    step, ``fallen`` (bool, see ``Robot``).
+    ``is_success`` (bool), ``position`` (float32 ``(2,)``, m), ``reward_terms`` (name -> float, their sum is the reward) and,
+    after a step, ``fallen`` (bool, see ``Robot``).
 
     An episode depends on its seed and the actions alone, not on what happened before: it is started by repositioning
     bodies, which in PyBullet leaves no trace in later steps for a body without legs.

@@ -101,8 +101,9 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
         # The zoo would make a constant schedule of a number, of which our algorithms make a cosine (learning_rate_floor).
-        given = {"learning_rate": rate for rate in [hyperparams.get("learning_rate")] if isinstance(rate, int | float)}
-        return {**rl_zoo3.exp_manager.ExperimentManager._preprocess_schedules(hyperparams), **given}
+        rate = hyperparams.get("learning_rate")
+        hyperparams = rl_zoo3.exp_manager.ExperimentManager._preprocess_schedules(hyperparams)
+        return {**hyperparams, "learning_rate": rate} if isinstance(rate, int | float) else hyperparams
 
     def learn(self, model: BaseAlgorithm) -> None:
         if not self.continue_training:
