@@ -50,7 +50,9 @@ def test_every_dimension_is_blurred_its_own_way():
     discrete = shown[:, 1]
     assert set(discrete) == set(truth[:, 1]) == {np.float32(value) for value in VALUES}
     changed = (discrete != truth[:, 1]).mean()
-    assert 0.0 < changed == pytest.approx(std[:, 1].mean() * 2 / 3, abs=0.04)  # a third draws the same value
+    # Uncertainty counts in steps from one value to the next; a third draws the same value.
+    share = np.minimum(std[:, 1] / np.diff(sorted(VALUES)).min(), 1.0).mean()
+    assert 0.0 < changed == pytest.approx(share * 2 / 3, abs=0.04)
     for dim in (0, 2):
         noise = (shown[:, dim] - truth[:, dim]) / (0.5 * std[:, dim])
         unclipped = np.abs(shown[:, dim]) < 0.25

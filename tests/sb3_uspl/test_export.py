@@ -39,6 +39,8 @@ def make_model(algorithm=USPLPPO, memory="gru", target=None, action_space=None, 
         keys = ["common", "target", "privileged"] if target is not None else ["common", "privileged"]
         venv = VecNormalize(venv, norm_obs_keys=keys)
     sizes = dict(hidden=(16,), trunk=(16,), embedding=(16,))
+    if algorithm is RESeLPPO:  # it hears its own continuous action: at high frequencies, untrained, rounding errors grow
+        sizes["frequencies"] = 0
     kwargs = dict(memory=memory, encoder_kwargs=sizes)
     model = algorithm("MlpPolicy", venv, n_steps=16, batch_size=64, policy_kwargs=kwargs, device="cpu", seed=0)
     rng = th.Generator().manual_seed(0)
