@@ -377,9 +377,9 @@ class USPLPPO(PPO):
         times = getattr(self, name)
         if times is None:
             return None
+        if not (isinstance(times, list | tuple) and len(times) == 2 and 0.0 < times[0] <= times[1]):
+            raise ValueError(f"{name}={times!r}: give the least and the greatest time in s as two positive numbers.")
         low, high = (time / self.decision_period for time in times)  # type: ignore[operator]
-        if not 0.0 < low <= high:
-            raise ValueError(f"{name}={times}: give the least and the greatest time in s, both positive.")
         return max(low, 1.0), max(high, 1.0)
 
     def _ask_discrete_privileged(self) -> dict[int, list[float]]:

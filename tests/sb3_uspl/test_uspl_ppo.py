@@ -405,3 +405,11 @@ def test_a_chosen_uncertainty_of_zero_is_certainty_not_nan():
     certain, least = (model.policy.act(obs, deterministic=True, uncertainty=u)[0] for u in (0.0, 0.005))
     np.testing.assert_array_equal(certain, least)
     assert np.isfinite(certain).all()
+
+
+@pytest.mark.parametrize("name", ["wander_time", "mismatch_hold_time"])
+@pytest.mark.parametrize("times", ["(0.5, 2.0)", (3.0, 1.0), [1.0], (0.0, 1.0)])
+def test_a_range_of_times_is_two_positive_numbers(name, times):
+    venv = DummyVecEnv([ToyEnv] * 2)
+    with pytest.raises(ValueError, match=f"{name}=.*two positive numbers"):
+        USPLPPO("MlpPolicy", venv, n_steps=8, batch_size=16, mismatch_fraction=0.0, **{name: times})
