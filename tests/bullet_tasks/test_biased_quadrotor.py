@@ -9,7 +9,7 @@ from scripted_policies import run_episode
 import bullet_tasks  # noqa: F401
 from bullet_tasks.robots.quadrotor_ends import HoverLimits
 from bullet_tasks.tasks.base import Outcome
-from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotor, BiasedQuadrotorConfig
+from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotorConfig
 
 PHYSICS = ("compiled", "kinematic", "full")
 N_EPISODES = {"compiled": 200, "kinematic": 25, "full": 25}
@@ -295,20 +295,3 @@ def test_impossible_hovers_and_periods_are_refused():
         HoverLimits(hold_time=0.0)
     with pytest.raises(ValueError, match="whole number"):
         make(decision_period=0.21, time_limit=12.6)
-
-
-def test_the_task_card_is_complete():
-    lines = [line.strip() for line in BiasedQuadrotor.__doc__.splitlines()]
-    wanted = [
-        "Description",
-        "Observation spaces",
-        "Action",
-        "Rewards",
-        "Success",
-        "Termination",
-        "Optimal behaviour",
-        "Differences from the paper",
-        "Source",
-    ]
-    positions = [lines.index(section) for section in wanted]
-    assert positions == sorted(positions)

@@ -29,17 +29,6 @@ from bullet_tasks.vec_env import BulletVecEnv
 
 N_EPISODES = 500
 IK_TOLERANCE = 2e-4  # m
-CARD_SECTIONS = (
-    "Description",
-    "Observation spaces",
-    "Action",
-    "Rewards",
-    "Success",
-    "Termination",
-    "Optimal behaviour",
-    "Differences from the paper",
-    "Source",
-)
 
 
 @pytest.fixture
@@ -445,9 +434,3 @@ def test_every_corner_of_every_possible_world_is_within_reach():
                 env.step(np.array(action))
                 assert env.robot._body.hand() == pytest.approx(env.robot.state[:3], abs=IK_TOLERANCE)
         env.close()
-
-
-def test_the_task_card_is_complete():
-    lines = [line.strip() for line in BlindMassStack.__doc__.splitlines()]
-    positions = [next(i for i, line in enumerate(lines) if line.startswith(section)) for section in CARD_SECTIONS]
-    assert positions == sorted(positions)

@@ -15,17 +15,6 @@ from bullet_tasks.tasks.lateral_choice import LateralChoice, LateralChoiceConfig
 
 DECISION = 0.25  # s
 N_SUBSTEPS = 5
-CARD_SECTIONS = (
-    "Description",
-    "Observation spaces",
-    "Action",
-    "Rewards",
-    "Success",
-    "Termination",
-    "Optimal behaviour",
-    "Differences from the paper",
-    "Source",
-)
 
 
 @pytest.fixture
@@ -188,9 +177,3 @@ def test_a_belief_is_drawn_where_the_goal_is(env):
 def test_impossible_worlds_are_refused(arguments, words):
     with pytest.raises(ValueError, match=words):
         LateralChoice(LateralChoiceConfig(**arguments))
-
-
-def test_the_task_card_is_complete():
-    lines = [line.strip() for line in LateralChoice.__doc__.splitlines()]
-    positions = [next(i for i, line in enumerate(lines) if line.startswith(section)) for section in CARD_SECTIONS]
-    assert positions == sorted(positions)

@@ -14,17 +14,6 @@ DECISION = 0.25  # s
 N_EPISODES = 100
 POST = np.array([4.65, 0.0])  # m
 BLOCKS = ("post_near", "post_middle", "post_far")
-CARD_SECTIONS = (
-    "Description",
-    "Observation spaces",
-    "Action",
-    "Rewards",
-    "Success",
-    "Termination",
-    "Optimal behaviour",
-    "Differences from the paper",
-    "Source",
-)
 
 
 @pytest.fixture(params=["kinematic", "compiled"])
@@ -167,9 +156,3 @@ def test_a_belief_is_drawn_where_the_goal_is(env):
 def test_impossible_worlds_are_refused(arguments, words):
     with pytest.raises(ValueError, match=words):
         SignpostNav(SignpostNavConfig(**arguments))
-
-
-def test_the_task_card_is_complete():
-    lines = [line.strip() for line in SignpostNav.__doc__.splitlines()]
-    positions = [next(i for i, line in enumerate(lines) if line.startswith(section)) for section in CARD_SECTIONS]
-    assert positions == sorted(positions)

@@ -18,17 +18,6 @@ from bullet_tasks.tasks.square_maze import SquareMaze, SquareMazeConfig
 DECISION = 0.25  # s
 N_EPISODES = 100
 CORNERS = list(itertools.product((1.0, -1.0), (1.0, -1.0)))
-CARD_SECTIONS = (
-    "Description",
-    "Observation spaces",
-    "Action",
-    "Rewards",
-    "Success",
-    "Termination",
-    "Optimal behaviour",
-    "Differences from the paper",
-    "Source",
-)
 
 
 @pytest.fixture(params=["kinematic", "compiled"])
@@ -186,9 +175,3 @@ def test_circles_of_mirrored_corners_must_not_touch():
     Corners((0.5, 2.0), DECISION, 20.0, 0.4, NavigationReward())
     with pytest.raises(ValueError, match="mirrored corners touch"):
         Corners((0.3, 2.0), DECISION, 20.0, 0.4, NavigationReward())
-
-
-def test_the_task_card_is_complete():
-    lines = [line.strip() for line in SquareMaze.__doc__.splitlines()]
-    positions = [next(i for i, line in enumerate(lines) if line.startswith(section)) for section in CARD_SECTIONS]
-    assert positions == sorted(positions)
