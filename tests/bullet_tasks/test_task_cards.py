@@ -1,5 +1,7 @@
 """Every task has a card, whose sections come in the same order."""
 
+import inspect
+
 import gymnasium
 import pytest
 
@@ -22,7 +24,7 @@ SECTIONS = (
 @pytest.mark.parametrize("env_id", TASKS)
 def test_the_task_card_is_complete(env_id):
     env = gymnasium.make(env_id, physics="compiled")
-    lines = [line.strip() for line in type(env.unwrapped.task).__doc__.splitlines()]
+    lines = inspect.cleandoc(type(env.unwrapped.task).__doc__).splitlines()  # a section's text is indented
     env.close()
     positions = [next(i for i, line in enumerate(lines) if line.startswith(section)) for section in SECTIONS]
     assert positions == sorted(positions)
