@@ -6,8 +6,11 @@ from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotor
 from bullet_tasks.tasks.blind_mass_stack import BlindMassStack
 from bullet_tasks.tasks.lateral_choice import LateralChoice
 from bullet_tasks.tasks.midpoint_choice import MidpointChoice
+from bullet_tasks.tasks.midpoint_choice_depth import MidpointChoiceDepth
 from bullet_tasks.tasks.signpost_nav import SignpostNav
+from bullet_tasks.tasks.signpost_nav_depth import SignpostNavDepth
 from bullet_tasks.tasks.square_maze import SquareMaze
+from bullet_tasks.tasks.stairway_search import StairwaySearch
 
 # Environment id -> task class. The task module's ``make_env`` builds the environment.
 _TASKS = {
@@ -15,6 +18,9 @@ _TASKS = {
     "SquareMaze-v0": SquareMaze,
     "SignpostNav-v0": SignpostNav,
     "MidpointChoice-v0": MidpointChoice,
+    "SignpostNavDepth-v0": SignpostNavDepth,
+    "MidpointChoiceDepth-v0": MidpointChoiceDepth,
+    "StairwaySearchDepth-v0": StairwaySearch,
     "BiasedQuadrotor-v0": BiasedQuadrotor,
     "BlindMassStack-v0": BlindMassStack,
 }

@@ -30,6 +30,8 @@ class RobotState(NamedTuple):
     """m/s"""
     in_contact: bool
     """Whether something pressed on the body during the substep."""
+    pitch: float = 0.0
+    """rad, nose down positive."""
 
 
 class Stretch(NamedTuple):

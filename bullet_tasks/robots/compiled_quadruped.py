@@ -64,7 +64,7 @@ class CompiledQuadruped(LeglessQuadruped):
         return super().advance(n_substeps, judge)
 
     def _walk(self, circles: np.ndarray, fall_height: float, n_substeps: int) -> Stretch:
-        x, y, z, yaw, _, _, _ = self.state
+        x, y, z, yaw = self.state[:4]
         scene = self._world.scene
         x, y, yaw, vx, vy, pressed, done, contacts, code = kernels.walk(
             scene.packed,
@@ -81,7 +81,7 @@ class CompiledQuadruped(LeglessQuadruped):
             z + HALF_TRUNK_HEIGHT,
             n_substeps,
         )
-        self.state = RobotState(x, y, z, yaw, vx, vy, pressed)
+        self.state = RobotState(x, y, z, yaw, vx, vy, pressed, self._pitched(done * SUBSTEP))
         return Stretch(done, contacts, OUTCOMES[code])
 
     def appear(self, simulation: Simulation) -> None:

@@ -73,7 +73,7 @@ class KinematicQuadruped(LeglessQuadruped):
 
     def substep(self) -> RobotState:
         """Let 1/20 s pass (see base class)."""
-        x0, y0, height, yaw, _, _, _ = self.state
+        x0, y0, height, yaw = self.state[:4]
         rate = max(-MAX_YAW_RATE, min(MAX_YAW_RATE, YAW_GAIN * (self._target_yaw - yaw)))
         # The mean heading of the substep makes an arc of chords of the right radius.
         heading = yaw + 0.5 * rate * SUBSTEP
@@ -92,5 +92,6 @@ class KinematicQuadruped(LeglessQuadruped):
             (x - x0) / SUBSTEP,
             (y - y0) / SUBSTEP,
             self._pressed(self._body, CONTACT_FORCE),
+            self._pitched(SUBSTEP),
         )
         return self.state

@@ -75,8 +75,6 @@ class QuadrotorState(RobotState):
     """Height above where it would stand on the ground, m."""
     roll: float
     """rad"""
-    pitch: float
-    """rad"""
     roll_rate: float
     """Of the angle, rad/s."""
     pitch_rate: float
@@ -122,9 +120,9 @@ def state_of(flight: np.ndarray, floor: float) -> QuadrotorState:
         impact_tilt,
         time,
     ) = flight.tolist()
-    state = QuadrotorState(x, y, z + floor, yaw, vx, vy, touching != 0.0)
+    state = QuadrotorState(x, y, z + floor, yaw, vx, vy, touching != 0.0, pitch)
     state.altitude = z - HALF_EXTENTS[2]
-    state.roll, state.pitch = roll, pitch
+    state.roll = roll
     state.roll_rate, state.pitch_rate, state.yaw_rate = roll_rate, pitch_rate, yaw_rate
     state.vz = vz
     state.landed = landed != 0.0

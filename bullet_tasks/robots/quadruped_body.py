@@ -22,6 +22,8 @@ MASS = 12.46
 """kg (a1.urdf)."""
 YAW_GAIN = 8.0
 """Of the proportional heading law, 1/s."""
+PITCH_RATE = 0.8
+"""Greatest change of the body pitch, rad/s, that of the walking robot's gait."""
 SUBSTEP = 1.0 / 20.0
 """Time that a substep takes without legs, s."""
 
@@ -63,6 +65,7 @@ class LeglessQuadruped(Robot[QuadrupedCommand]):
         self.state = RobotState(0.0, 0.0, BODY_HEIGHT, 0.0, 0.0, 0.0, False)
         self._speed = 0.0
         self._target_yaw = 0.0
+        self._target_pitch = 0.0
 
     def reset(self, x: float, y: float, ground: float, yaw: float) -> RobotState:
         """
@@ -73,13 +76,13 @@ class LeglessQuadruped(Robot[QuadrupedCommand]):
         :param ground: height of the floor there, m
         :param yaw: rad
         """
-        self._speed, self._target_yaw = 0.0, yaw
+        self._speed, self._target_yaw, self._target_pitch = 0.0, yaw, 0.0
         self.state = RobotState(x, y, ground + BODY_HEIGHT, yaw, 0.0, 0.0, False)
         return self.state
 
     def command(self, command: QuadrupedCommand) -> None:
         """
-        Walk at a speed and turn towards a heading (see base class). The pitch only matters to sensors and legs.
+        Walk at a speed, turn towards a heading and a body pitch (see base class). The pitch only matters to sensors and legs.
 
         :param command: a target more than half a turn away is reached the shorter way round
         """
@@ -88,3 +91,13 @@ class LeglessQuadruped(Robot[QuadrupedCommand]):
         if abs(turn) > _HALF_TURN:
             turn = math.remainder(turn, math.tau)
         self._target_yaw = self.state.yaw + turn
+        self._target_pitch = command.pitch
+
+    def _pitched(self, time: float) -> float:
+        """
+        Body pitch, rad.
+
+        :param time: after the present state, s
+        """
+        pitch, most = self.state.pitch, PITCH_RATE * time
+        return pitch + max(-most, min(most, self._target_pitch - pitch))

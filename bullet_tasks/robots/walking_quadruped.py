@@ -92,7 +92,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         self.roll = 0.0
         """Of the trunk, rad."""
         self.pitch = 0.0
-        """Of the trunk, rad, nose down positive: what a camera on it needs besides ``state``."""
+        """Of the trunk, rad, nose down positive."""
         self.fallen = False
         """Whether the robot has fallen since it was placed."""
         self.state = RobotState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
@@ -221,7 +221,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
             pressed = pressed or self._pressed()
             yaw = self._measure(yaw)
         x, y, z = measured[: gait.TRUNK_Z + 1].tolist()
-        self.state = RobotState(x, y, z, yaw, (x - x0) / SUBSTEP, (y - y0) / SUBSTEP, pressed)
+        self.state = RobotState(x, y, z, yaw, (x - x0) / SUBSTEP, (y - y0) / SUBSTEP, pressed, self.pitch)
         tilted = max(abs(self.roll), abs(self.pitch)) > FALLEN_TILT
         self.fallen = self.fallen or tilted or z - self.trot.ground < FALLEN_HEIGHT
         return self.state

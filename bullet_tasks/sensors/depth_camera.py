@@ -121,18 +121,17 @@ class DepthCamera(Sensor):
         self._images.clear()
         self._readings, self._updates = 0, 0
 
-    def read(self, state: RobotState, pitch: float = 0.0) -> np.ndarray:
+    def read(self, state: RobotState) -> np.ndarray:
         """
         The image that the camera shows now (see base class).
 
         :param state: of the robot that carries the camera
-        :param pitch: of the robot's body, rad, nose down positive
         :return: uint8 ``(1, height, width)``
         :raises RuntimeError: before the first ``reset``
         """
         updates = 1 + int(self._readings * self._updates_per_reading + _DUE)
         if updates > self._updates:
-            self._images.append(self._image(self.depth(CameraPose(state.x, state.y, state.z, state.yaw, pitch))))
+            self._images.append(self._image(self.depth(CameraPose(state.x, state.y, state.z, state.yaw, state.pitch))))
         self._readings, self._updates = self._readings + 1, updates
         return self._images[0].copy()
 

@@ -30,8 +30,8 @@ LENSES = {"release": RELEASE, "64x48": Intrinsics.from_field_of_view(64, 48, mat
 WALL = Box("wall", (1.5, 0.0, 0.0), (0.5, 10.0, 10.0))
 
 
-def state(x=0.0, yaw=0.0):
-    return RobotState(x, 0.0, 0.3, yaw, 0.0, 0.0, False)
+def state(x=0.0, yaw=0.0, pitch=0.0):
+    return RobotState(x, 0.0, 0.3, yaw, 0.0, 0.0, False, pitch)
 
 
 def camera_at(*shapes, seed=0, lower_ground=-math.inf, **options):
@@ -150,7 +150,7 @@ def test_the_camera_goes_with_the_body():
 def test_a_pitched_body_looks_down():
     # Level, the ground 10 m below is out of range; nose down, it is seen.
     camera = camera_at(lower_ground=-0.5, far=1.5)
-    level, down = camera.read(state()), camera_at(lower_ground=-0.5, far=1.5).read(state(), pitch=0.6)
+    level, down = camera.read(state()), camera_at(lower_ground=-0.5, far=1.5).read(state(pitch=0.6))
     assert (level[0, :30] == 255).all()
     assert down.mean() < level.mean() - 20
     expected = camera.depth(CameraPose(0.0, 0.0, 0.3, 0.0, 0.6))
