@@ -47,13 +47,13 @@ def points_in_world(observation, camera):
 
 def along_and_beside(points, corner):
     """
-    Coordinates of points along a corner's diagonal and their distance from it, m.
+    Coordinates of points along a corner's diagonal and how far to its left they are, m.
 
     :param points: ``(n, 3)``
     :param corner: signs of its x and y
     """
     x, y = corner
-    return points[:, :2] @ np.array((x, y)) / math.sqrt(2.0), np.abs(points[:, :2] @ np.array((-y, x))) / math.sqrt(2.0)
+    return points[:, :2] @ np.array((x, y)) / math.sqrt(2.0), points[:, :2] @ np.array((-y, x)) / math.sqrt(2.0)
 
 
 class SignSeer:
@@ -102,15 +102,17 @@ class SignSeer:
 
 class ColumnSeer:
     """
-    Solve Midpoint Choice by sight: walk round the middle until the heights of all columns have been seen.
+    Solve Midpoint Choice by sight: walk round the middle until a column before every corner, or none, has been seen.
 
     :param camera: of the environment
     """
 
-    HALF_SQUARE = 0.6  # m
-    ALONG, BESIDE = (2.30, 2.75), (0.40, 1.10)  # m, footprint of a column
-    SEEN_FROM = 2.0  # m, in which the whole of a column is in the image
-    VIEW = math.radians(15.0)
+    HALF_SQUARE = 0.75  # m
+    ALONG, BESIDE = 2.52, 0.74  # m, middle of a column
+    HALF_SIZE = (0.22, 0.36)  # m, of its footprint, along and beside
+    AHEAD = (0.9, 1.75)  # m; in between, the whole of a column is in the image
+    ASIDE = 0.65  # of what is ahead
+    ROUNDING = 0.02  # m
 
     def __init__(self, camera: DepthCamera) -> None:
         self.camera = camera
@@ -118,38 +120,49 @@ class ColumnSeer:
         self.route: Route | None = None
         self.choice: tuple[float, float] | None = None
 
+    def look(self, observation: dict[str, np.ndarray]) -> None:
+        """
+        Measure the columns that are before the camera.
+
+        :param observation: ``common`` and ``target`` are read, nothing else
+        """
+        points, lens = points_in_world(observation, self.camera), lens_pose(observation, self.camera)
+        c, s = math.cos(lens.yaw), math.sin(lens.yaw)
+        for corner in CORNERS:
+            along, beside = along_and_beside(points, corner)
+            for side in (1.0, -1.0):
+                x, y = (np.array(corner) * self.ALONG + side * self.BESIDE * np.array((-corner[1], corner[0]))) / math.sqrt(
+                    2.0
+                )
+                ahead, left = c * (x - lens.x) + s * (y - lens.y), c * (y - lens.y) - s * (x - lens.x)
+                if self.AHEAD[0] < ahead < self.AHEAD[1] and abs(left) < self.ASIDE * ahead:
+                    on_column = np.abs(along - self.ALONG) < self.HALF_SIZE[0]
+                    on_column &= np.abs(side * beside - self.BESIDE) < self.HALF_SIZE[1]
+                    heights = np.append(points[on_column, 2], self.ROUNDING) - self.ROUNDING
+                    self.heights[corner] = max(float(heights.max()), self.heights.get(corner, 0.0))
+
     def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """
         :param observation: ``common`` and ``target`` are read, nothing else
         """
-        here, points = np.array(position(observation)), points_in_world(observation, self.camera)
-        lens = lens_pose(observation, self.camera)
-        for corner in CORNERS:
-            way = 2.5 / math.sqrt(2.0) * np.array(corner) - (lens.x, lens.y)
-            ahead = math.remainder(math.atan2(way[1], way[0]) - lens.yaw, math.tau)
-            if math.hypot(*way) < self.SEEN_FROM and abs(ahead) < self.VIEW:
-                along, beside = along_and_beside(points, corner)
-                on_column = (self.ALONG[0] < along) & (along < self.ALONG[1])
-                on_column &= (self.BESIDE[0] < beside) & (beside < self.BESIDE[1])
-                heights = np.append(points[on_column, 2], 0.0)
-                self.heights[corner] = max(float(heights.max()), self.heights.get(corner, 0.0))
+        self.look(observation)
         if self.choice is None and len(self.heights) == len(CORNERS):
             self.choice = sorted(self.heights, key=lambda corner: -self.heights[corner])[1]
         if self.choice is not None:
             return towards(observation, through_the_gap(observation, self.choice))
         if self.route is None:
-            # From corner to corner of a square whose corners are before the columns, so that each is looked at.
             way = [(x * self.HALF_SQUARE, y * self.HALF_SQUARE) for x, y in CORNERS]
-            first = min(range(4), key=lambda i: math.dist(here, way[i]))
+            first = min(range(4), key=lambda i: math.dist(position(observation), way[i]))
             self.route = Route((way[first:] + way[:first]) * 4)
         return self.route(observation)
 
 
 class StairFinder:
     """
-    Solve Stairway Search by sight: look over the middle of an edge, which shows both of its corners, then over the opposite one.
+    Solve Stairway Search by sight: look over the middle of an edge, which shows both of its corners, then over the opposite.
 
     :param camera: of the environment
+    :param pitch: of the body while it looks, in units of the action
     """
 
     EDGES = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
@@ -178,7 +191,9 @@ class StairFinder:
         points = points[np.abs(points[:, :2]).max(axis=1) > self.OUTSIDE]
         for corner in CORNERS:
             along, beside = along_and_beside(points, corner)
-            there = (along > 0.0) & (along < self.ALONG) & (self.BESIDE[0] < beside) & (beside < self.BESIDE[1])
+            there = (
+                (along > 0.0) & (along < self.ALONG) & (self.BESIDE[0] < np.abs(beside)) & (np.abs(beside) < self.BESIDE[1])
+            )
             heights = points[there, 2]
             self.steps[corner] += int(((self.STEPS[0] < heights) & (heights < self.STEPS[1])).sum())
             self.ground[corner] += int((heights < self.GROUND).sum())
