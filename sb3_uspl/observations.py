@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 COMMON, TARGET, PRIVILEGED = "common", "target", "privileged"
 TRUTH, UNCERTAINTY, BELIEF = "truth", "uncertainty", "belief"
@@ -26,6 +27,17 @@ PREVIOUS_ACTION, EPISODE_STEP, WANDERING = "previous_action", "episode_step", "w
 
 POLICY_KEYS = (COMMON, PRIVILEGED, TRUTH, UNCERTAINTY, BELIEF)
 """What PPO's networks and rollout buffer hold; the encoder's inputs (``target``, previous actions) never reach them."""
+
+
+def is_image(space: spaces.Space) -> bool:
+    """
+    Whether the encoder takes a space for images: uint8 from 0 to 255, or float16 with finite bounds.
+
+    :param space: of the key ``target``
+    """
+    if not isinstance(space, spaces.Box) or len(space.shape) != 3:
+        return False
+    return is_image_space(space) or (space.dtype == np.float16 and space.is_bounded() and bool((space.low < space.high).all()))
 
 
 def check_observation_space(space: spaces.Space) -> spaces.Dict:
@@ -48,14 +60,37 @@ def check_observation_space(space: spaces.Space) -> spaces.Dict:
     for key, part in space.spaces.items():
         if not isinstance(part, spaces.Box):
             raise ValueError(f"The space of '{key}' is {part}; it must be a Box (nested Dicts: flatten them first).")
-        if len(part.shape) != 1 and not (key == TARGET and is_image_space(part)):
-            allowed = (
-                "one-dimensional, or a uint8 image of shape (channels, height, width)" if key == TARGET else "one-dimensional"
-            )
+        if len(part.shape) != 1 and not (key == TARGET and is_image(part)):
+            allowed = "one-dimensional"
+            if key == TARGET:
+                allowed += (
+                    ", or a uint8 image (or a float16 one with finite bounds) of shape (channels, height, width). If "
+                    "VecNormalize has made it so, leave the images to the encoder: VecNormalize(..., norm_obs_keys=['common'])"
+                )
             raise ValueError(f"The space of '{key}' has the shape {part.shape} and dtype {part.dtype}; it must be {allowed}.")
         if part.shape[0] == 0:
             raise ValueError(f"The space of '{key}' is empty; it must have at least one dimension.")
     return space
+
+
+def check_normalization(venv: VecEnv) -> None:
+    """
+    Refuse images that ``VecNormalize`` normalises pixel by pixel: they would arrive on another scale than the encoder assumes.
+
+    The space of uint8 images changes when they are normalised, that of float16 images does not.
+
+    :param venv: environments under the observation contract
+    :raises ValueError: naming the remedy
+    """
+    normalize = unwrap_vec_normalize(venv)
+    space = venv.observation_space
+    if normalize is None or not normalize.norm_obs or not isinstance(space, spaces.Dict) or TARGET not in space.spaces:
+        return
+    if TARGET in (normalize.norm_obs_keys or ()) and is_image(space[TARGET]):
+        raise ValueError(
+            f"VecNormalize normalises the images under '{TARGET}' (norm_obs_keys={normalize.norm_obs_keys}), which the "
+            "encoder does itself: use VecNormalize(..., norm_obs_keys=['common'])."
+        )
 
 
 def check_finite(observation: Mapping[str, np.ndarray]) -> None:

@@ -8,7 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
@@ -27,6 +27,7 @@ from sb3_uspl.observations import (
     UNCERTAINTY,
     check_finite,
     check_observation_space,
+    is_image,
     policy_observation_space,
 )
 from sb3_uspl.uncertainty import INITIAL_STD, smooth
@@ -366,10 +367,10 @@ class USPLCnnPolicy(USPLPolicy):
 
     def __init__(self, observation_space: spaces.Space, *args: Any, **kwargs: Any):
         space = check_observation_space(observation_space)
-        if TARGET not in space.spaces or not is_image_space(space[TARGET]):
+        if TARGET not in space.spaces or not is_image(space[TARGET]):
             raise ValueError(
-                f"CnnPolicy needs a uint8 image (channels, height, width) under 'target', but the space is {space}. "
-                "Use MlpPolicy or MultiInputPolicy."
+                f"CnnPolicy needs a uint8 image (channels, height, width) or a float16 one under 'target', but the space is "
+                f"{space}. Use MlpPolicy or MultiInputPolicy."
             )
         super().__init__(observation_space, *args, **kwargs)
 

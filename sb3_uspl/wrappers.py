@@ -25,6 +25,7 @@ from sb3_uspl.observations import (
     UNCERTAINTY,
     WANDERING,
     check_finite,
+    check_normalization,
 )
 from sb3_uspl.uncertainty import (
     C_MAX,
@@ -158,9 +159,11 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     :param encoder: observation encoder
     :param config: blurring, reward transformation, smoothing
     :param seed: of the blur noise and the mismatching
+    :raises ValueError: if images are normalised
     """
 
     def __init__(self, venv: VecEnv, encoder: ObservationEncoder, config: UncertaintyConfig, seed: int | None = None):
+        check_normalization(venv)
         super().__init__(venv)
         self.encoder, self.config = encoder, config
         self.progress = 0.0

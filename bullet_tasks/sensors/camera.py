@@ -133,5 +133,5 @@ RELEASE = Intrinsics.from_field_of_view(106, 42, math.radians(87.0)).cropped(lef
 there; here the pixels are cast as they are."""
 
 SMALL = RELEASE.resized(48, 36)
-"""The same view in a third of the pixels: at 1.5 m, 5.5 cm across and 3 cm up and down. Stable-Baselines3 takes none with fewer than
-36 rows or columns."""
+"""The same view in a third of the pixels: at 1.5 m, 5.5 cm across and 3 cm up and down. Stable-Baselines3's own
+networks take no image with fewer than 36 rows or columns."""

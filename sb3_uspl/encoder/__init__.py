@@ -1,7 +1,7 @@
 """Observation encoder: features (MLP, CNN), memory (GRU, Transformer with KV cache), belief head (mean, std)."""
 
 from sb3_uspl.encoder.encoder import MAX_STD, MIN_STD, PRESETS, Belief, ObservationEncoder, gaussian_nll, soft_clamp
-from sb3_uspl.encoder.features import FourierFeatures, RunningNormalizer, TokenFeatures, Tokens, encode_actions
+from sb3_uspl.encoder.features import FourierFeatures, ImageCNN, RunningNormalizer, TokenFeatures, Tokens, encode_actions
 from sb3_uspl.encoder.memory import MEMORIES, GRUMemory, Memory, MemoryState, TransformerMemory, reset_rows, take_rows
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "Belief",
     "FourierFeatures",
     "GRUMemory",
+    "ImageCNN",
     "Memory",
     "MemoryState",
     "ObservationEncoder",

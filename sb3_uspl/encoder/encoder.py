@@ -10,21 +10,27 @@ from torch import nn
 
 from sb3_uspl.encoder.features import TokenFeatures, Tokens, mlp
 from sb3_uspl.encoder.memory import MEMORIES, MemoryState
-from sb3_uspl.observations import PRIVILEGED
+from sb3_uspl.observations import PRIVILEGED, TARGET, is_image
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Trains on two CPU cores.
     "small": dict(
         hidden=(128,),
+        hidden_beside_image=None,
+        convolutions=((16, 8, 4, 1), (32, 3, 2, 1)),
+        image_layers=(64,),
         trunk=(128,),
         embedding=(128,),
         head=(),
         frequencies=4,
         memory_kwargs={"gru": {}, "transformer": {}},
     ),
-    # Sizes of App. C.3.3 (non-image; the image branch is added when the target is an image).
+    # Sizes of App. C.3.3.
     "paper": dict(
         hidden=(512, 256, 128),
+        hidden_beside_image=(512, 256),
+        convolutions=((32, 5, 1, 2), (64, 3, 1, 1)),
+        image_layers=(128, 128),
         trunk=(1024, 512, 256),
         embedding=(256, 128),
         head=(512, 256),
@@ -32,6 +38,15 @@ PRESETS: dict[str, dict[str, Any]] = {
         memory_kwargs={"gru": {}, "transformer": {"n_heads": 16, "head_width": 64}},
     ),
 }  # fmt: skip
+"""
+Sizes of the encoder: ``hidden`` layers for the common observation and for a vector target, ``hidden_beside_image`` for the
+common observation if the target is an image (None: ``hidden``), the image's ``convolutions`` and ``image_layers`` (see
+``ImageCNN``), the ``trunk`` before the memory, the ``embedding`` after it, the ``head`` of mean and standard deviation,
+``frequencies`` of the Fourier features.
+"""
+
+IMAGE_TOKENS = 2048
+"""Without gradients, long sequences of images go through the CNN in parts of this size, for the memory that it takes."""
 
 MIN_STD, MAX_STD = 0.005, 1.0
 """Range of the predicted standard deviation (release: log-std softly clamped to [ln 0.005, 0])."""
@@ -91,7 +106,7 @@ class ObservationEncoder(nn.Module):
     :param preset: "small" or "paper", see ``PRESETS``
     :param memory: "gru" or "transformer", see ``MEMORIES``
     :param overrides: replaces single entries of the preset
-    :raises ValueError: for an unknown preset, memory or override
+    :raises ValueError: for an unknown preset, memory or override, or images that are too small for the CNN
     """
 
     def __init__(
@@ -115,7 +130,16 @@ class ObservationEncoder(nn.Module):
             )
         sizes = {**PRESETS[preset], **(overrides or {})}
         n_privileged = space[PRIVILEGED].shape[0]  # type: ignore[index]
-        self.features = TokenFeatures(space, n_action, sizes["hidden"], sizes["trunk"], sizes["frequencies"])
+        sees = TARGET in space.spaces and is_image(space[TARGET])
+        self.features = TokenFeatures(
+            space,
+            n_action,
+            (sees and sizes["hidden_beside_image"]) or sizes["hidden"],
+            sizes["trunk"],
+            sizes["frequencies"],
+            sizes["convolutions"],
+            sizes["image_layers"],
+        )
         self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
         self.embedding = mlp(self.memory.width, sizes["embedding"])
         if sizes["embedding"]:
@@ -140,8 +164,14 @@ class ObservationEncoder(nn.Module):
         :param lengths: of the episodes, ``(n_episodes,)``
         :return: beliefs ``(n_tokens, n_privileged)`` and the memory after each episode's last token
         """
-        memory, state = self.memory(self.features(tokens), lengths)
+        memory, state = self.memory(self._features(tokens), lengths)
         return self._belief(memory), state
+
+    def _features(self, tokens: Tokens) -> th.Tensor:
+        if th.is_grad_enabled() or not self.features.has_image:
+            return self.features(tokens)
+        parts = zip(*(tensor.split(IMAGE_TOKENS) for tensor in tokens.values()), strict=True)
+        return th.cat([self.features(dict(zip(tokens, part, strict=True))) for part in parts])
 
     def step(self, tokens: Tokens, state: MemoryState, longest: int | None = None) -> tuple[Belief, MemoryState]:
         """

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
-from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, TARGET
+from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, TARGET, is_image
 
 Tokens = dict[str, th.Tensor]
 """Encoder inputs by key (``common``, ``target``, ``previous_action``), each ``(..., *shape of the key)``."""
@@ -112,38 +112,65 @@ class FourierFeatures(nn.Module):
         return th.cat([x, *[f(angle) for angle in angles for f in (th.sin, th.cos)]], dim=-1)
 
 
-class DepthCNN(nn.Module):
+Convolutions = Sequence[tuple[int, int, int, int]]
+"""Channels, kernel, stride and max-pooling (1: none) of each layer."""
+
+
+class ImageCNN(nn.Module):
     """
-    Image features of App. C.3.3: conv 5x5 (32), max-pool 2, conv 3x3 (64), two layers of 128, Tanh.
+    Image features: convolutions and fully connected layers with ELU between them, Tanh at the end (App. C.3.3).
 
-    :param space: image space ``(channels, height, width)``
-    :param channels: channels of the two convolutions
+    Images come as they are stored; here their numbers are brought from the bounds of the space to [-0.5, 0.5].
+
+    :param space: image space ``(channels, height, width)``, uint8 or float16
+    :param convolutions: see ``Convolutions``
+    :param fully_connected: width of each layer, at least one
+    :raises ValueError: if a layer is impossible, or the images are too small for the convolutions
     """
 
-    WIDTH = 128
-
-    def __init__(self, space: spaces.Box, channels: tuple[int, int] = (32, 64)):
+    def __init__(self, space: spaces.Box, convolutions: Convolutions, fully_connected: Sequence[int]):
         super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(space.shape[0], channels[0], 5),
-            nn.MaxPool2d(2),
-            nn.ELU(),
-            nn.Conv2d(channels[0], channels[1], 3),
-            nn.ELU(),
-            nn.Flatten(),
-        )
-        with th.no_grad():
-            n_flat = self.convolutions(th.zeros(1, *space.shape)).shape[1]
-        self.fully_connected = nn.Sequential(
-            nn.Linear(n_flat, self.WIDTH), nn.ELU(), nn.Linear(self.WIDTH, self.WIDTH), nn.Tanh()
-        )
+        if not fully_connected or not all(len(layer) == 4 and min(layer) >= 1 for layer in convolutions):
+            raise ValueError(
+                f"convolutions={convolutions}, image_layers={fully_connected}: every convolution is (channels, kernel, "
+                "stride, max-pooling), at least 1 each, and there must be at least one fully connected layer."
+            )
+        n_channels, height, width = space.shape
+        least = _least_size(convolutions)
+        if min(height, width) < least:
+            raise ValueError(
+                f"Images of {height} x {width} pixels are too small for the encoder's convolutions {tuple(convolutions)} "
+                f"(channels, kernel, stride, max-pooling): use at least {least} x {least} pixels, encoder='small', or "
+                "policy_kwargs=dict(encoder_kwargs=dict(convolutions=...))."
+            )
+        layers: list[nn.Module] = []
+        for channels, kernel, stride, pooling in convolutions:
+            layers.append(nn.Conv2d(n_channels, channels, kernel, stride))
+            layers += [nn.MaxPool2d(pooling)] if pooling > 1 else []
+            layers.append(nn.ELU())
+            height, width = (((size - kernel) // stride + 1) // pooling for size in (height, width))
+            n_channels = channels
+        self.convolutions = nn.Sequential(*layers, nn.Flatten())
+        self.fully_connected = mlp(n_channels * height * width, fully_connected)
+        self.fully_connected[-1] = nn.Tanh()
+        self.width = fully_connected[-1]
+        """Number of features."""
+        self.low, self.range = float(space.low.min()), float(space.high.max()) - float(space.low.min())
 
     def forward(self, images: th.Tensor) -> th.Tensor:
         """
-        :param images: ``(n, channels, height, width)``, bytes
-        :return: ``(n, 128)``
+        :param images: ``(n, channels, height, width)``, in the dtype of the space
+        :return: ``(n, width)``
         """
-        return self.fully_connected(self.convolutions(images.float() / 255.0))
+        return self.fully_connected(self.convolutions((images.float() - self.low) / self.range - 0.5))
+
+
+def _least_size(convolutions: Convolutions) -> int:
+    """Height and width of the smallest image of which one pixel is left."""
+    size = 1
+    for _, kernel, stride, pooling in reversed(convolutions):
+        size = (size * pooling - 1) * stride + kernel
+    return size
 
 
 class TokenFeatures(nn.Module):
@@ -155,9 +182,21 @@ class TokenFeatures(nn.Module):
     :param hidden: layers for each kind of input
     :param trunk: layers after the concatenation
     :param frequencies: of :class:`FourierFeatures` for the common observation and the action
+    :param convolutions: of an image, see :class:`ImageCNN`
+    :param image_layers: its fully connected layers
+    :raises ValueError: if the image is too small for the convolutions
     """
 
-    def __init__(self, space: spaces.Dict, n_action: int, hidden: Sequence[int], trunk: Sequence[int], frequencies: int = 0):
+    def __init__(
+        self,
+        space: spaces.Dict,
+        n_action: int,
+        hidden: Sequence[int],
+        trunk: Sequence[int],
+        frequencies: int = 0,
+        convolutions: Convolutions = (),
+        image_layers: Sequence[int] = (128, 128),
+    ):
         super().__init__()
         common, target = space[COMMON], space.spaces.get(TARGET)
         assert isinstance(common, spaces.Box)
@@ -165,12 +204,12 @@ class TokenFeatures(nn.Module):
         self.common_fourier = FourierFeatures(frequencies)
         self.common = mlp((common.shape[0] + n_action) * self.common_fourier.factor, hidden)
         width = hidden[-1]
-        self.has_image = target is not None and is_image_space(target)
+        self.has_image = target is not None and is_image(target)
         self.has_vector_target = target is not None and not self.has_image
         if self.has_image:
             assert isinstance(target, spaces.Box)
-            self.image = DepthCNN(target)
-            width += DepthCNN.WIDTH
+            self.image = ImageCNN(target, convolutions, image_layers)
+            width += self.image.width
         if self.has_vector_target:
             assert isinstance(target, spaces.Box)
             self.target_normalizer = RunningNormalizer(target.shape[0])
@@ -198,7 +237,7 @@ class TokenFeatures(nn.Module):
         if self.has_image:
             images = tokens[TARGET]
             batch = images.shape[:-3]
-            parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, DepthCNN.WIDTH))
+            parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, self.image.width))
         return self.trunk(th.cat(parts, dim=-1))
 
     @staticmethod

@@ -1,0 +1,235 @@
+"""Images as targets: seen by the encoder alone, stored once in their own dtype, never normalised by anybody else."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_uspl import RMA, USPLPPO
+from sb3_uspl.encoder import MEMORIES, ImageCNN, ObservationEncoder, gaussian_nll
+from sb3_uspl.encoder import encoder as encoder_module
+from sb3_uspl.observations import POLICY_KEYS, TARGET, check_observation_space, is_image
+from tests.sb3_uspl.toy import ToyEnv
+
+SMALL = ((16, 8, 4, 1), (32, 3, 2, 1))
+PAPER = ((32, 5, 1, 2), (64, 3, 1, 1))
+BYTES = spaces.Box(0, 255, (1, 36, 48), np.uint8)
+HALVES = spaces.Box(-1.0, 1.0, (1, 36, 48), np.float16)
+IMAGES = pytest.mark.parametrize("image", [BYTES, HALVES], ids=["uint8", "float16"])
+
+
+class SignEnv(ToyEnv):
+    """The sign that is to be found out is on the image of the third observation, and nowhere else."""
+
+    def _observe(self):
+        obs = super()._observe()
+        obs["common"][1] = 0.0
+        space = self.observation_space["target"]
+        # Nothing on the others: 64 episodes of noise would be learned by heart.
+        obs["target"] = np.full_like(obs["target"], 0.5 * (space.low.min() + space.high.max()))
+        if self.t == 2:
+            half = space.shape[2] // 2
+            obs["target"][..., :half] = space.high.max() if self.hidden[0] > 0 else space.low.min()
+        return obs
+
+
+def make_encoder(image, preset="small", memory="gru", **overrides):
+    th.manual_seed(0)
+    encoder = ObservationEncoder(ToyEnv(target=image).observation_space, 1, preset, memory, overrides)
+    for head in (encoder.mean[-1], encoder.log_std[-1]):  # a belief that moves visibly with every token
+        th.nn.init.normal_(head.weight, std=1.0)
+    return encoder
+
+
+def make_tokens(image, n):
+    target = np.stack([image.sample() for _ in range(n)])
+    return {"common": th.randn(n, 2), "previous_action": th.randn(n, 1), "target": th.as_tensor(target)}
+
+
+def make_model(image=BYTES, algorithm=USPLPPO, env=SignEnv, **kwargs):
+    venv = make_vec_env(env, n_envs=4, env_kwargs={"target": image})
+    kwargs = {"n_steps": 16, "batch_size": 32, "n_epochs": 2, "mismatch_fraction": 0.5, "encoder_updates": 3} | kwargs
+    return algorithm("CnnPolicy", venv, encoder_batch_size=64, seed=0, device="cpu", **kwargs)
+
+
+def test_the_papers_cnn_hand_counted():
+    cnn = ImageCNN(spaces.Box(0, 255, (1, 58, 87), np.uint8), PAPER, (128, 128))
+    # (58, 87) - conv 5 -> (54, 83) - pool -> (27, 41) - conv 3 -> (25, 39), the 64 x 25 x 39 of the release.
+    shapes = [tuple(part.shape) for part in cnn.parameters()]
+    expected = [(32, 1, 5, 5), (32,), (64, 32, 3, 3), (64,), (128, 64 * 25 * 39), (128,), (128, 128), (128,)]
+    assert shapes == expected
+    kinds = [type(layer).__name__ for layer in (*cnn.convolutions, *cnn.fully_connected)]
+    assert kinds == ["Conv2d", "MaxPool2d", "ELU", "Conv2d", "ELU", "Flatten", "Linear", "ELU", "Linear", "Tanh"]
+
+
+def test_the_papers_layers_beside_the_image():
+    def widths(**kwargs):
+        encoder = make_encoder(kwargs.pop("image", BYTES), **kwargs)
+        return [layer.out_features for layer in encoder.features.common if isinstance(layer, th.nn.Linear)]
+
+    assert widths(preset="paper") == [512, 256]
+    assert widths(preset="paper", image=None) == [512, 256, 128]
+    assert widths(preset="small", hidden=(32,)) == [32]
+    assert widths(preset="paper", hidden_beside_image=(16,)) == [16]
+
+
+@IMAGES
+def test_numbers_reach_the_cnn_within_one_unit(image):
+    cnn, seen = ImageCNN(image, SMALL, (64,)), []
+    cnn.convolutions[0].register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    cnn(th.as_tensor(np.stack([image.low, image.high])))
+    assert (seen[0][0] == -0.5).all() and (seen[0][1] == 0.5).all() and seen[0].dtype == th.float32
+
+
+@pytest.mark.parametrize("preset", ["small", "paper"])
+@pytest.mark.parametrize("memory", MEMORIES)
+@IMAGES
+def test_steps_equal_whole_episodes(preset, memory, image):
+    encoder, lengths = make_encoder(image, preset, memory), [5, 3]
+    tokens = make_tokens(image, sum(lengths))
+    with th.no_grad():
+        whole, _ = encoder(tokens, th.tensor(lengths))
+        for episode, start in ((0, 0), (1, 5)):
+            state = encoder.memory.initial_state(1)
+            for t in range(start, start + lengths[episode]):
+                belief, state = encoder.step({key: value[t : t + 1] for key, value in tokens.items()}, state)
+                th.testing.assert_close(belief.mean[0], whole.mean[t], atol=1e-4, rtol=1e-3)
+                th.testing.assert_close(belief.std[0], whole.std[t], atol=1e-4, rtol=1e-3)
+    assert whole.mean.std() > 1e-3
+
+
+def test_parts_of_many_images_equal_all_at_once(monkeypatch):
+    encoder, tokens = make_encoder(BYTES), make_tokens(BYTES, 25)
+    lengths = th.tensor([20, 5])
+    at_once = encoder(tokens, lengths)[0].mean.detach()
+    calls = []
+    encoder.features.image.register_forward_hook(lambda module, inputs, output: calls.append(len(output)))
+    monkeypatch.setattr(encoder_module, "IMAGE_TOKENS", 10)
+    with th.no_grad():
+        th.testing.assert_close(encoder(tokens, lengths)[0].mean, at_once, atol=1e-5, rtol=1e-4)
+    assert calls == [10, 10, 5]
+    encoder(tokens, lengths)
+    assert calls[3:] == [25], "gradients need all of them"
+
+
+def test_the_image_matters_and_is_learned_from():
+    encoder = make_encoder(BYTES)
+    tokens = make_tokens(BYTES, 4)
+    lengths = th.tensor([4])
+    before = encoder(tokens, lengths)[0].mean
+    changed = tokens | {"target": 255 - tokens["target"]}
+    assert not th.allclose(encoder(changed, lengths)[0].mean, before)
+    gaussian_nll(encoder(tokens, lengths)[0], th.zeros(4, 1)).backward()
+    assert all(part.grad is not None and part.grad.abs().max() > 0 for part in encoder.features.image.parameters())
+
+
+@IMAGES
+@pytest.mark.parametrize("algorithm", [USPLPPO, RMA])
+def test_only_the_encoder_holds_images(image, algorithm):
+    model = make_model(image, algorithm)
+    model.learn(4 * 16 * 2)
+    assert set(model.rollout_buffer.observations) == set(POLICY_KEYS)
+    assert model.policy.observation_space[POLICY_KEYS[0]].shape == (2,) and TARGET not in model.policy.observation_space.spaces
+    for part in (model.policy.pi_features_extractor, model.policy.vf_features_extractor, model.policy.mlp_extractor):
+        assert not any(isinstance(layer, th.nn.Conv2d) for layer in part.modules())
+    episodes = model.rollout_buffer.episodes
+    assert len(episodes.replay) > 3
+    for arrays in (episodes.running, *(episode.arrays for episode in episodes.replay)):
+        assert arrays["target"].dtype == image.dtype
+        assert [key for key, array in arrays.items() if array.shape[-3:] == image.shape] == [TARGET], "once"
+    # Beside the image, an episode holds a few numbers.
+    pixels = sum(episode.arrays["target"].nbytes for episode in episodes.replay)
+    assert pixels < episodes.nbytes < 1.05 * pixels
+
+
+def test_ppos_networks_are_never_given_an_image(monkeypatch):
+    model, keys = make_model(), set()
+    extractors = (model.policy.pi_features_extractor, model.policy.vf_features_extractor)
+    for extractor in extractors:
+        extractor.register_forward_pre_hook(lambda module, inputs: keys.update(inputs[0]))
+    model.learn(4 * 16)
+    assert keys == set(POLICY_KEYS)
+
+
+@IMAGES
+def test_what_an_image_shows_is_found_out(image):
+    """The encoder is certain after the third image, the only one that tells, and not before."""
+    th.manual_seed(0)
+    encoder = ObservationEncoder(SignEnv(target=image).observation_space, 1)
+    optimizer, env = th.optim.Adam(encoder.parameters(), 2e-3), SignEnv(target=image)
+    env.observation_space.seed(0)
+    episodes = []
+    for seed in range(64):
+        observations = [env.reset(seed=seed)[0]] + [env.step(env.action_space.low)[0] for _ in range(4)]
+        episodes += observations
+    tokens = {key: th.as_tensor(np.stack([obs[key] for obs in episodes])) for key in ("common", "target")}
+    tokens["previous_action"] = th.zeros(len(episodes), 1)
+    truth = th.as_tensor(np.stack([obs["privileged"] for obs in episodes]))
+    lengths = th.full((64,), 5)
+    for _ in range(80):
+        loss = gaussian_nll(encoder(tokens, lengths)[0], truth)
+        optimizer.zero_grad()
+        loss.backward()
+        th.nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)
+        optimizer.step()
+    std = encoder(tokens, lengths)[0].std.view(64, 5).mean(0)
+    assert std[3:].max() < 0.5 * std[:1].min()
+
+
+def test_the_deployment_policy_sees_the_image_and_nothing_privileged():
+    model = make_model()
+    for head in (model.policy.encoder.mean[-1],):
+        th.nn.init.normal_(head.weight, std=1.0)
+    obs = model.env.reset()
+    action, _ = model.predict(obs, deterministic=True)
+    other, _ = model.predict(obs | {"privileged": -obs["privileged"]}, deterministic=True)
+    assert np.array_equal(action, other)
+    other, _ = model.predict(obs | {"target": 255 - obs["target"]}, deterministic=True)
+    assert not np.allclose(action, other)
+
+
+@pytest.mark.parametrize(
+    ("size", "preset", "least"), [((1, 15, 40), "small", 16), ((1, 40, 15), "small", 16), ((1, 9, 20), "paper", 10)]
+)
+def test_images_that_the_cnn_cannot_take_are_refused(size, preset, least):
+    def image(size):
+        return spaces.Box(0, 255, size, np.uint8)
+
+    with pytest.raises(ValueError, match=rf"too small.*{least} x {least}.*convolutions"):
+        make_encoder(image(size), preset)
+    make_encoder(image((1, least, least)), preset)
+    make_encoder(image(size), preset, convolutions=((8, 3, 1, 1),))
+
+
+@pytest.mark.parametrize(
+    "overrides", [{"convolutions": ((8, 3, 1),)}, {"convolutions": ((8, 0, 1, 1),)}, {"image_layers": ()}]
+)
+def test_impossible_layers_are_refused(overrides):
+    with pytest.raises(ValueError, match=r"channels, kernel, stride, max-pooling"):
+        make_encoder(BYTES, **overrides)
+
+
+def test_what_is_an_image():
+    assert is_image(BYTES) and is_image(HALVES)
+    unbounded = spaces.Box(-np.inf, np.inf, (1, 36, 48), np.float16)
+    floats = spaces.Box(0.0, 1.0, (1, 36, 48), np.float32)
+    for space in (unbounded, floats, spaces.Box(0.0, 1.0, (36,), np.float16), spaces.Discrete(3)):
+        assert not is_image(space)
+    with pytest.raises(ValueError, match=r"float16 one with finite bounds.*norm_obs_keys=\['common'\]"):
+        check_observation_space(ToyEnv(target=unbounded).observation_space)
+
+
+@pytest.mark.parametrize("image", [BYTES, HALVES], ids=["uint8", "float16"])
+def test_normalised_images_are_refused(image):
+    def venv(keys):
+        return VecNormalize(make_vec_env(ToyEnv, n_envs=4, env_kwargs={"target": image}), norm_obs_keys=keys)
+
+    def learn(keys):
+        few = {"n_steps": 8, "batch_size": 32, "encoder_updates": 1, "encoder_batch_size": 32}
+        USPLPPO("MultiInputPolicy", venv(keys), mismatch_fraction=0.5, device="cpu", **few).learn(32)
+
+    with pytest.raises(ValueError, match=r"VecNormalize.*norm_obs_keys=\['common'\]"):
+        learn(["common", "target"])
+    learn(["common"])
