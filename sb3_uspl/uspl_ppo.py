@@ -66,6 +66,9 @@ class USPLPPO(PPO):
         detours; 0: not at all
     :param warmup_timesteps: decisions before blurring and reward transformation set in (l = 0; C.3.1: 100 epochs). None: 20 %
         of the first ``learn``.
+    :param policy_warmup: whether actor and critic learn during the warm-up. Without it, the policy of the warm-up is an
+        untrained one: the encoder learns from its strolls, and PPO meets blurring and reward transformation before it has
+        learned to do without information.
     :param ramp_timesteps: decisions over which the progress coefficient l rises to 1 (C.3.1: 300 epochs). None: 50 % of the
         first ``learn``.
     :param blur: privileged blurring, Eq. 3 and 4
@@ -149,6 +152,7 @@ class USPLPPO(PPO):
         action_std_floor: float = 0.2,
         action_noise_time: float = 0.0,
         warmup_timesteps: int | None = None,
+        policy_warmup: bool = True,
         ramp_timesteps: int | None = None,
         blur: bool = True,
         reward_scaling: bool = True,
@@ -223,6 +227,7 @@ class USPLPPO(PPO):
         self.action_std, self.action_std_floor = action_std, action_std_floor
         self.action_noise_time = action_noise_time
         self.warmup_timesteps, self.ramp_timesteps = warmup_timesteps, ramp_timesteps
+        self.policy_warmup = policy_warmup
         self.blur, self.reward_scaling = blur, reward_scaling
         self.uncertainty_input, self.mean_input = uncertainty_input, mean_input and uncertainty_input
         self.c_min, self.c_max, self.delta = c_min, c_max, delta
@@ -474,17 +479,20 @@ class USPLPPO(PPO):
 
     def train(self) -> None:
         """PPO's update, then the encoder's (Alg. 1, lines 12 and 13)."""
-        super().train()
-        self.policy.update_normalizers(self.rollout_buffer.observations[COMMON])
         wrapper, episodes = self._rollout_env, self.rollout_buffer.episodes
         assert wrapper is not None and episodes is not None
+        untrained = wrapper.progress == 0.0 and not self.policy_warmup
+        if not untrained:
+            super().train()
+        common = self.rollout_buffer.observations[COMMON]
+        self.policy.update_normalizers(common.reshape(-1, common.shape[-1]))
         for name, values in wrapper.metrics.items():
             self.logger.record(f"uspl/{name}", float(np.mean(values)))
         wrapper.metrics.clear()
         self.logger.record("uspl/progress", wrapper.progress)
         # An episode that ended with the rollout's last decision is over, though no observation has been added since.
         episodes.close_ended(wrapper.step_count)
-        episodes.telltale = wrapper.progress == 0.0
+        episodes.telltale = wrapper.progress == 0.0 and not untrained
         if self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0):
             self._train_encoder(episodes)
             self.policy.encoder.eval()

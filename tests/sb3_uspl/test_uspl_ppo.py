@@ -110,6 +110,21 @@ def test_no_encoder_updates_in_warmup_if_asked_so():
     assert_equal_parameters(before, parameters(model), "encoder.")
 
 
+def test_no_policy_updates_in_warmup_if_asked_so():
+    """The encoder learns from an untrained policy, whose behaviour gives nothing away: also from matched episodes."""
+    model = make_model(policy_warmup=False, warmup_timesteps=512, ramp_timesteps=0)
+    before = parameters(model)
+    model.learn(256)
+    after = parameters(model)
+    for module in ("mlp_extractor.", "action_net.", "value_net."):
+        assert_equal_parameters(before, after, module)
+    assert any(not th.equal(before[name], after[name]) for name in before if name.startswith("encoder."))
+    assert not model.rollout_buffer.episodes.telltale
+    model.learn(768, reset_num_timesteps=False)
+    later = parameters(model)
+    assert all(not th.equal(before[name], later[name]) for name in ("action_net.weight", "value_net.weight"))
+
+
 def test_schedules_reach_their_ends():
     seen = []
 
