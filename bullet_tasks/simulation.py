@@ -62,13 +62,18 @@ class _Client(BulletClient):
         self._client = pybullet.connect(mode)
 
 
-def quaternion(yaw: float) -> tuple[float, float, float, float]:
+def quaternion(yaw: float, pitch: float = 0.0) -> tuple[float, float, float, float]:
     """
-    Rotation about the vertical axis in PyBullet's order (x, y, z, w).
+    Rotation about the vertical axis, after one about the axis to the left, in PyBullet's order (x, y, z, w).
 
     :param yaw: rad
+    :param pitch: rad, nose down positive
     """
-    return 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+    s, c = math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+    if pitch == 0.0:
+        return 0.0, 0.0, s, c
+    s_pitch, c_pitch = math.sin(0.5 * pitch), math.cos(0.5 * pitch)
+    return -s * s_pitch, c * s_pitch, s * c_pitch, c * c_pitch
 
 
 def _facets(cylinder: Cylinder) -> tuple[Box, ...]:
@@ -187,16 +192,17 @@ class Simulation:
         except KeyError:
             raise KeyError(f"No body {name!r} in this simulation, only {sorted(self._ids)}.") from None
 
-    def place(self, name: str, position: Vector3, yaw: float = 0.0) -> None:
+    def place(self, name: str, position: Vector3, yaw: float = 0.0, pitch: float = 0.0) -> None:
         """
         Put a body somewhere, at rest.
 
         :param name: its name
         :param position: m
         :param yaw: rad
+        :param pitch: rad, nose down positive
         """
         body = self.body_id(name)
-        self.client.resetBasePositionAndOrientation(body, position, quaternion(yaw))
+        self.client.resetBasePositionAndOrientation(body, position, quaternion(yaw, pitch))
         self.client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def contact_forces(self, name: str) -> dict[str, float]:

@@ -93,4 +93,5 @@ class CompiledQuadruped(LeglessQuadruped):
         if not self._appeared:
             simulation.add_body(self.name, None, looks(), (0.0, 0.0, BODY_HEIGHT))
             self._appeared = True
-        simulation.place(self.name, (self.state.x, self.state.y, self.state.z), self.state.yaw)
+        x, y, z, yaw = self.state[:4]
+        simulation.place(self.name, (x, y, z), yaw, self.state.pitch)

@@ -4,6 +4,7 @@ import math
 
 import gymnasium
 import numpy as np
+import pybullet
 import pytest
 from scripted_policies import run_episode, through_the_gap, towards
 from scripted_seeing import CORNERS, ColumnSeer, SignSeer, StairFinder, along_and_beside, points_in_world
@@ -281,6 +282,20 @@ def test_what_the_camera_shows_is_where_it_is():
                 assert (points[face, 2] < left.top + 0.02).all() and (points[face, 2] > -0.01).all()
             observation, *_ = env.step(np.ones(1, np.float32))
     assert n_tops > 200
+    env.close()
+
+
+def test_a_body_without_pybullet_bows_in_pictures():
+    env = gymnasium.make("StairwaySearchDepth-v0", physics="compiled", render_mode="rgb_array")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.ones(2, np.float32))
+    env.render()
+    simulation, state = env.unwrapped.world.simulation, env.unwrapped.robot.state
+    position, orientation = simulation.client.getBasePositionAndOrientation(simulation.body_id("robot"))
+    expected = pybullet.getQuaternionFromEuler((0.0, MAX_PITCH, state.yaw))
+    assert position == pytest.approx(state[:3])
+    assert np.abs(np.dot(orientation, expected)) == pytest.approx(1.0) and math.hypot(*orientation[:2]) > 0.1
     env.close()
 
 
