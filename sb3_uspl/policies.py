@@ -1,6 +1,7 @@
 """Policies: actor and critic for PPO, and the observation encoder that turns the actor into the deployment policy."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -237,14 +238,14 @@ class USPLPolicy(ActorCriticPolicy):
             if isinstance(features.common_normalizer, RunningNormalizer):
                 features.common_normalizer.update(th.as_tensor(common, dtype=th.float32, device=self.device))
 
-    def set_action_std(self, std: float) -> None:
+    def set_action_std(self, std: float | Sequence[float] | np.ndarray) -> None:
         """
         Fix the standard deviation of continuous actions (App. C.3.1 anneals it instead of learning it).
 
-        :param std: standard deviation of the sampled actions
+        :param std: standard deviation of the sampled actions, of all or of each, ``(n_action,)``
         """
         self.log_std.requires_grad_(False)
-        self.log_std.data.fill_(math.log(std))
+        self.log_std.data.copy_(th.as_tensor(np.log(std)))
 
     def predict(  # type: ignore[override]
         self,

@@ -1,6 +1,7 @@
 """USPL on top of Stable-Baselines3's PPO (Alg. 1)."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
+from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from sb3_uspl.encoder import Belief, gaussian_nll
 from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
@@ -59,11 +61,13 @@ class USPLPPO(PPO):
     :param rollout_buffer_kwargs: its further arguments
     :param target_kl: of PPO
     :param learning_rate_floor: share of the learning rate left at the end of training (release: 1/20)
-    :param action_std: initial standard deviation of continuous actions, annealed by a cosine, not learned (Table 4: 0.35;
-        Table 5: 0.65). None learns it, as stock PPO does.
+    :param action_std: initial standard deviation of continuous actions, of all or of each, annealed by a cosine, not learned
+        (Table 4: 0.35; Table 5: 0.65). None learns it, as stock PPO does.
     :param action_std_floor: share of ``action_std`` left at the end of training (release: 1/5)
-    :param action_noise_time: time constant in s over which the noise of continuous actions is correlated, so that it finds
-        detours; 0: not at all
+    :param action_noise_time: time constant in s over which the noise of continuous actions is correlated during the warm-up, so
+        that it finds detours; 0: not at all
+    :param action_noise_timesteps: decisions after the warm-up over which that time constant falls to 0 along a cosine. PPO
+        takes the noise for independent, and learns to fight it by jerks where precision is asked for.
     :param warmup_timesteps: decisions before blurring and reward transformation set in (l = 0; C.3.1: 100 epochs). None: 20 %
         of the first ``learn``.
     :param policy_warmup: whether actor and critic learn during the warm-up. Without it, the policy of the warm-up is an
@@ -148,9 +152,10 @@ class USPLPPO(PPO):
         rollout_buffer_kwargs: dict[str, Any] | None = None,
         target_kl: float | None = None,
         learning_rate_floor: float = 0.05,
-        action_std: float | None = 0.35,
+        action_std: float | Sequence[float] | None = 0.35,
         action_std_floor: float = 0.2,
         action_noise_time: float = 0.0,
+        action_noise_timesteps: int = 500_000,
         warmup_timesteps: int | None = None,
         policy_warmup: bool = True,
         ramp_timesteps: int | None = None,
@@ -225,7 +230,7 @@ class USPLPPO(PPO):
         )
         self.learning_rate_floor = learning_rate_floor
         self.action_std, self.action_std_floor = action_std, action_std_floor
-        self.action_noise_time = action_noise_time
+        self.action_noise_time, self.action_noise_timesteps = action_noise_time, action_noise_timesteps
         self.warmup_timesteps, self.ramp_timesteps = warmup_timesteps, ramp_timesteps
         self.policy_warmup = policy_warmup
         self.blur, self.reward_scaling = blur, reward_scaling
@@ -285,10 +290,10 @@ class USPLPPO(PPO):
             self.seed,
         )
         if self.action_std is not None and isinstance(self.action_space, spaces.Box):
-            self._action_std_schedule: CosineSchedule | None = CosineSchedule(self.action_std, self.action_std_floor)
+            self._action_std_share: CosineSchedule | None = CosineSchedule(1.0, self.action_std_floor)
             self.policy.set_action_std(self.action_std)
         else:
-            self._action_std_schedule = None
+            self._action_std_share = None
         self._uncertainty_config = UncertaintyConfig(
             blur=self.blur,
             reward_scaling=self.reward_scaling,
@@ -335,6 +340,13 @@ class USPLPPO(PPO):
                 f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give "
                 "them finite bounds, or use blur_noise='gaussian'."
             )
+        n_action = get_flattened_obs_dim(self.action_space)
+        if self.action_std is not None:
+            stds = np.asarray(self.action_std, dtype=float)
+            if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():
+                raise ValueError(
+                    f"action_std={self.action_std}: give one positive number, or one for each of the {n_action} action values."
+                )
         ranges = {
             "warmup_timesteps": (self.warmup_timesteps or 0, 0, np.inf),
             "ramp_timesteps": (self.ramp_timesteps or 0, 0, np.inf),
@@ -342,12 +354,12 @@ class USPLPPO(PPO):
             "blur_hold_time": (self.blur_hold_time, 0, np.inf),
             "smoothing_time": (self.smoothing_time, 0, np.inf),
             "action_noise_time": (self.action_noise_time, 0, np.inf),
+            "action_noise_timesteps": (self.action_noise_timesteps, 0, np.inf),
             "c_max": (self.c_max, 0, np.inf),
             "delta": (self.delta, 0, np.inf),
             "encoder_updates": (self.encoder_updates, 0, np.inf),
             "encoder_batch_size": (self.encoder_batch_size, 1, np.inf),
             "context_length": (self.context_length, 1, np.inf),
-            "action_std": (1.0 if self.action_std is None else self.action_std, 1e-6, np.inf),
             "encoder_beta": (self.encoder_beta, 0, 1),
             "wander_share_matched": (self.wander_share_matched, 0, 1),
             "wander_share": (self.wander_share, 0, 1),
@@ -462,8 +474,15 @@ class USPLPPO(PPO):
         wrapper.progress = self.progress
         if self.mismatch_hold_time is None:
             wrapper.redraw_mismatch()
-        if self._action_std_schedule is not None:
-            self.policy.set_action_std(self._action_std_schedule(self._current_progress_remaining))
+        remaining = self._current_progress_remaining
+        if self._action_std_share is not None:
+            assert self.action_std is not None
+            self.policy.set_action_std(self._action_std_share(remaining) * np.asarray(self.action_std))
+        if isinstance(self.policy.action_dist, CorrelatedGaussianDistribution):
+            assert self.decision_period is not None and self._progress_period is not None
+            fall = cosine_progress(self.num_timesteps, self._progress_period[0], self.action_noise_timesteps)
+            correlation = smoothing_factor(self.action_noise_time * (1.0 - fall), self.decision_period)
+            self.policy.action_dist.correlation = correlation
         # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.
         threads = th.get_num_threads()
         th.set_num_threads(1)

@@ -142,6 +142,31 @@ def test_schedules_reach_their_ends():
     assert all(a >= b for a, b in itertools.pairwise(stds)) and stds[0] > 0.39 and stds[-1] > 0.1
 
 
+def test_each_action_has_its_own_standard_deviation_if_asked_so():
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    model = make_model(env_kwargs={"action_space": space}, action_std=[0.1, 0.5], action_std_floor=0.5)
+    th.testing.assert_close(model.policy.log_std.exp(), th.tensor([0.1, 0.5]))
+    model.learn(512)
+    std = model.policy.log_std.exp()
+    assert std[1] / std[0] == pytest.approx(5.0) and 0.05 < std[0] < 0.09
+
+
+def test_correlation_of_the_action_noise_falls_to_nothing():
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            seen.append(self.model.policy.action_dist.correlation)
+            return True
+
+    model = make_model(action_noise_time=1.0, action_noise_timesteps=256, warmup_timesteps=256)
+    model.learn(1024, callback=Watch())
+    per_rollout = seen[::16]
+    assert per_rollout[:3] == pytest.approx([np.exp(-0.2)] * 3) and per_rollout[3] == pytest.approx(np.exp(-0.4))
+    assert per_rollout[4:] == [0.0] * 4
+    assert all(a >= b for a, b in itertools.pairwise(seen))
+
+
 # -- deployment --------------------------------------------------------------------------------------------------------------
 
 
@@ -372,6 +397,8 @@ def test_success_of_the_privileged_policy_leaves_out_mismatched_environments():
         (dict(decision_period=0.0), "decision_period=0.0 is outside"),
         (dict(mismatch_fraction=1.5), "mismatch_fraction=1.5 is outside"),
         (dict(smoothing_time=-1.0), "smoothing_time=-1.0 is outside"),
+        (dict(action_std=0.0), "one positive number"),
+        (dict(action_std=[0.1, 0.2]), "one for each of the 1 action"),
         (dict(use_sde=True), "use_sde"),
         (dict(policy="CnnPolicy"), "needs a uint8 image"),
         (dict(policy_kwargs=dict(memory="lstm")), "the memories"),
