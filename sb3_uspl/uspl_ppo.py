@@ -64,8 +64,8 @@ class USPLPPO(PPO):
     :param action_std: initial standard deviation of continuous actions, of all or of each, annealed by a cosine, not learned
         (Table 4: 0.35; Table 5: 0.65). None learns it, as stock PPO does.
     :param action_std_floor: share of ``action_std`` left at the end of training (release: 1/5)
-    :param action_noise_time: time constant in s over which the noise of continuous actions is correlated during the warm-up, so
-        that it finds detours; 0: not at all
+    :param action_noise_time: time constant in s over which the noise of continuous actions is correlated during the warm-up,
+        so that it finds detours; 0: not at all
     :param action_noise_timesteps: decisions after the warm-up over which that time constant falls to 0 along a cosine. PPO
         takes the noise for independent, and learns to fight it by jerks where precision is asked for.
     :param warmup_timesteps: decisions before blurring and reward transformation set in (l = 0; C.3.1: 100 epochs). None: 20 %
