@@ -109,7 +109,7 @@ class USPLPolicy(ActorCriticPolicy):
     :param net_arch: layers of actor and critic, as in SB3
     :param activation_fn: their activation (ELU in the paper)
     :param encoder: preset of the encoder, "small" or "paper" (App. C.3.3)
-    :param memory: the encoder's memory, "gru" or "transformer"
+    :param memory: the encoder's memory, "gru", "transformer" or "max"
     :param encoder_kwargs: replaces single entries of the preset
     :param encoder_learning_rate: initial learning rate of the encoder
     :param encoder_weight_decay: weight decay of the encoder (Tables 4 and 5)

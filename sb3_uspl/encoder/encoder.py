@@ -23,7 +23,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         embedding=(128,),
         head=(),
         frequencies=4,
-        memory_kwargs={"gru": {}, "transformer": {}},
+        extremes=True,
+        memory_kwargs={},
     ),
     # Sizes of App. C.3.3.
     "paper": dict(
@@ -35,14 +36,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         embedding=(256, 128),
         head=(512, 256),
         frequencies=0,
-        memory_kwargs={"gru": {}, "transformer": {"n_heads": 16, "head_width": 64}},
+        extremes=False,
+        memory_kwargs={"transformer": {"n_heads": 16, "head_width": 64}},
     ),
 }  # fmt: skip
 """
 Sizes of the encoder: ``hidden`` layers for the common observation and for a vector target, ``hidden_beside_image`` for the
 common observation if the target is an image (None: ``hidden``), the image's ``convolutions`` and ``image_layers`` (see
 ``ImageCNN``), the ``trunk`` before the memory, the ``embedding`` after it, the ``head`` of mean and standard deviation,
-``frequencies`` of the Fourier features.
+``frequencies`` of the Fourier features, ``extremes`` of a vector target as inputs (see ``TokenFeatures``), and
+``memory_kwargs`` by the memory's name.
 """
 
 IMAGE_TOKENS = 2048
@@ -104,7 +107,7 @@ class ObservationEncoder(nn.Module):
     :param space: observation space of the environment (the contract)
     :param n_action: number of encoded action values; the previous action is an input
     :param preset: "small" or "paper", see ``PRESETS``
-    :param memory: "gru" or "transformer", see ``MEMORIES``
+    :param memory: "gru", "transformer" or "max", see ``MEMORIES``
     :param overrides: replaces single entries of the preset
     :raises ValueError: for an unknown preset, memory or override, or images that are too small for the CNN
     """
@@ -139,6 +142,7 @@ class ObservationEncoder(nn.Module):
             sizes["frequencies"],
             sizes["convolutions"],
             sizes["image_layers"],
+            sizes["extremes"],
         )
         self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
         self.embedding = mlp(self.memory.width, sizes["embedding"])

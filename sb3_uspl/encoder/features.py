@@ -184,6 +184,8 @@ class TokenFeatures(nn.Module):
     :param frequencies: of :class:`FourierFeatures` for the common observation and the action
     :param convolutions: of an image, see :class:`ImageCNN`
     :param image_layers: its fully connected layers
+    :param extremes: whether a vector target's least and greatest value are inputs of their own beside the common observation: of
+        scandots, how high the highest thing in sight is, which an MLP over all points takes long to find
     :raises ValueError: if the image is too small for the convolutions
     """
 
@@ -196,16 +198,19 @@ class TokenFeatures(nn.Module):
         frequencies: int = 0,
         convolutions: Convolutions = (),
         image_layers: Sequence[int] = (128, 128),
+        extremes: bool = False,
     ):
         super().__init__()
         common, target = space[COMMON], space.spaces.get(TARGET)
         assert isinstance(common, spaces.Box)
-        self.common_normalizer = RunningNormalizer(common.shape[0] + n_action)
-        self.common_fourier = FourierFeatures(frequencies)
-        self.common = mlp((common.shape[0] + n_action) * self.common_fourier.factor, hidden)
-        width = hidden[-1]
         self.has_image = target is not None and is_image(target)
         self.has_vector_target = target is not None and not self.has_image
+        self.extremes = extremes and self.has_vector_target
+        n_common = common.shape[0] + n_action + 2 * self.extremes
+        self.common_normalizer = RunningNormalizer(n_common)
+        self.common_fourier = FourierFeatures(frequencies)
+        self.common = mlp(n_common * self.common_fourier.factor, hidden)
+        width = hidden[-1]
         if self.has_image:
             assert isinstance(target, spaces.Box)
             self.image = ImageCNN(target, convolutions, image_layers)
@@ -240,6 +245,8 @@ class TokenFeatures(nn.Module):
             parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, self.image.width))
         return self.trunk(th.cat(parts, dim=-1))
 
-    @staticmethod
-    def _common_vector(tokens: Tokens) -> th.Tensor:
-        return th.cat([tokens[COMMON].float(), tokens[PREVIOUS_ACTION]], dim=-1)
+    def _common_vector(self, tokens: Tokens) -> th.Tensor:
+        parts = [tokens[COMMON].float(), tokens[PREVIOUS_ACTION]]
+        if self.extremes:
+            parts += th.aminmax(tokens[TARGET].float(), dim=-1, keepdim=True)
+        return th.cat(parts, dim=-1)

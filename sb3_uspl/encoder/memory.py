@@ -1,4 +1,4 @@
-"""The observation encoder's memory: one interface, two implementations, registered by name in ``MEMORIES``."""
+"""The observation encoder's memory: one interface, three implementations, registered by name in ``MEMORIES``."""
 
 from abc import ABC, abstractmethod
 
@@ -141,6 +141,41 @@ class GRUMemory(Memory):
         return outputs[:, 0], (hidden[0],)
 
 
+class MaxMemory(Memory):
+    """
+    Largest value so far of each of a number of learned features (Zaheer et al. 2017; Qi et al. 2017), beside the present ones.
+
+    Whatever was noticed once is remembered for the rest of the episode, however rarely it happens, and the gradient goes
+    straight to the decision at which it was noticed: what a robot must find and compare is learned from far fewer finds than
+    with a recurrence. It cannot average or count.
+
+    :param width: number of features of input and output
+    :param n_features: number of remembered features; None stands for twice the width
+    """
+
+    def __init__(self, width: int, n_features: int | None = None):
+        super().__init__(width)
+        self.n_features = 2 * width if n_features is None else n_features
+        self.notice = nn.Linear(width, self.n_features)
+        self.out = nn.Linear(self.n_features + width, width)
+
+    def initial_state(self, n_envs: int) -> MemoryState:
+        return (th.zeros(n_envs, self.n_features, device=self.out.weight.device),)
+
+    def _remember(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
+        mask = token_mask(lengths)
+        # Zero is where every memory begins, so nothing below it is noticed.
+        largest = th.cummax(_padded(F.relu(self.notice(features)), mask), dim=1).values
+        return self._output(largest[mask], features), (largest[:, -1].detach(),)
+
+    def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
+        largest = th.maximum(F.relu(self.notice(features)), state[0])
+        return self._output(largest, features), (largest,)
+
+    def _output(self, largest: th.Tensor, features: th.Tensor) -> th.Tensor:
+        return F.elu(self.out(th.cat((largest, features), dim=-1)))
+
+
 class TransformerMemory(Memory):
     """
     Causal Transformer with a cache of keys and values (paper, App. C.3.3), pre-norm with RMSNorm as in the release.
@@ -248,4 +283,4 @@ class _Block(nn.Module):
         return features + self.dropout(self.mlp(features))
 
 
-MEMORIES: dict[str, type[Memory]] = {"gru": GRUMemory, "transformer": TransformerMemory}
+MEMORIES: dict[str, type[Memory]] = {"gru": GRUMemory, "transformer": TransformerMemory, "max": MaxMemory}

@@ -28,7 +28,7 @@ from tests.sb3_uspl.toy import IMAGE, ToyEnv
 
 def make_memory(name):
     th.manual_seed(0)
-    return GRUMemory(16) if name == "gru" else TransformerMemory(16, n_heads=2, head_width=8, n_layers=2)
+    return MEMORIES[name](16, **({"n_heads": 2, "head_width": 8, "n_layers": 2} if name == "transformer" else {}))
 
 
 @pytest.mark.parametrize("name", MEMORIES)

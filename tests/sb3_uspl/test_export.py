@@ -28,7 +28,7 @@ VECTOR = spaces.Box(-1, 1, (3,), np.float32)
 CASES = {
     "gru": (USPLPPO, "gru", None, None),
     "transformer": (USPLPPO, "transformer", IMAGE, spaces.Discrete(3)),
-    "vector": (USPLPPO, "gru", VECTOR, spaces.MultiDiscrete([2, 3])),
+    "vector": (USPLPPO, "max", VECTOR, spaces.MultiDiscrete([2, 3])),
     "resel": (RESeLPPO, "transformer", None, spaces.Box(-2, 3, (2,), np.float32)),
 }
 
@@ -87,7 +87,7 @@ def load_example(path):
     return namespace["ExportedPolicy"](str(path))
 
 
-@pytest.fixture(scope="module", params=["gru", "transformer", "resel"])
+@pytest.fixture(scope="module", params=["gru", "transformer", "vector", "resel"])
 def exported(request, tmp_path_factory):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
