@@ -184,8 +184,8 @@ class TokenFeatures(nn.Module):
     :param frequencies: of :class:`FourierFeatures` for the common observation and the action
     :param convolutions: of an image, see :class:`ImageCNN`
     :param image_layers: its fully connected layers
-    :param extremes: whether a vector target's least and greatest value are inputs of their own beside the common observation: of
-        scandots, how high the highest thing in sight is, which an MLP over all points takes long to find
+    :param extremes: whether a vector target's least and greatest value are inputs of their own beside the common
+        observation: of scandots, how high the highest thing in sight is, which an MLP over all points takes long to find
     :raises ValueError: if the image is too small for the convolutions
     """
 

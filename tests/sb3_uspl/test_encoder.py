@@ -14,7 +14,6 @@ from sb3_uspl.encoder import (
     MIN_STD,
     Belief,
     FourierFeatures,
-    GRUMemory,
     ObservationEncoder,
     RunningNormalizer,
     TransformerMemory,
