@@ -19,11 +19,11 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Shape
+from sb3_uspl._arguments import PAPER_DECISION_PERIOD
 from sb3_uspl.chosen_uncertainty import ChosenUncertainty
 from sb3_uspl.observations import PRIVILEGED, TARGET
 from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR, BeliefInWorld, on_map
 from sb3_uspl.policies import DeploymentState, USPLPolicy
-from sb3_uspl.uspl_ppo import PAPER_DECISION_PERIOD
 
 FRAMES_PER_SECOND = 8.0
 """Decisions a second in the film; twice real time for decisions of 0.25 s."""

@@ -1,6 +1,5 @@
 """USPL on top of Stable-Baselines3's PPO (Alg. 1)."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -16,19 +15,23 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_uspl._arguments import (
+    ask_decision_period,
+    ask_discrete_privileged,
+    check_arguments,
+    count_mismatched,
+    in_decisions,
+)
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from sb3_uspl.encoder import Belief, gaussian_nll
-from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space
+from sb3_uspl.observations import COMMON
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
 from sb3_uspl.uncertainty import C_MAX, C_MIN, DELTA, smoothing_factor
 from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
 
 SelfUSPLPPO = TypeVar("SelfUSPLPPO", bound="USPLPPO")
-
-PAPER_DECISION_PERIOD = 0.02
-"""s; assumed for an environment that does not say how long a decision lasts."""
 
 
 class USPLPPO(PPO):
@@ -258,10 +261,10 @@ class USPLPPO(PPO):
     # -- set-up ------------------------------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
-        self.discrete_privileged = self._ask_discrete_privileged()
+        self.discrete_privileged = ask_discrete_privileged(self.env, self.discrete_privileged)
         self._check_arguments()
-        self.n_mismatched = self._count_mismatched()
-        self.decision_period = self._ask_decision_period()
+        self.n_mismatched = count_mismatched(self.mismatch_fraction, self.n_envs)
+        period = self.decision_period = ask_decision_period(self.env, self.decision_period)
         self.encoder_lr_schedule = FloatSchedule(self.encoder_learning_rate)
         smoothing = smoothing_factor(self.smoothing_time, self.decision_period)
         given = self.policy_kwargs, self.rollout_buffer_kwargs
@@ -294,6 +297,7 @@ class USPLPPO(PPO):
             self.policy.set_action_std(self.action_std)
         else:
             self._action_std_share = None
+        hold = self.mismatch_hold_time
         self._uncertainty_config = UncertaintyConfig(
             blur=self.blur,
             reward_scaling=self.reward_scaling,
@@ -306,115 +310,15 @@ class USPLPPO(PPO):
             delta=self.delta,
             discrete_privileged=self.discrete_privileged,
             n_mismatched=self.n_mismatched,
-            mismatch_hold=self._in_decisions("mismatch_hold_time"),
+            mismatch_hold=hold and in_decisions("mismatch_hold_time", hold, period),
             wander_share=self.wander_share,
             wander_share_matched=self.wander_share_matched,
-            wander_hold=self._in_decisions("wander_time") or (1.0, 1.0),
+            wander_hold=in_decisions("wander_time", self.wander_time, period),
         )
         self._rollout_env = None
 
     def _check_arguments(self) -> None:
-        space = check_observation_space(self.observation_space)[PRIVILEGED]
-        assert isinstance(space, spaces.Box)
-        if not issubclass(self.policy_class, USPLPolicy):
-            raise ValueError(f"USPLPPO needs a subclass of sb3_uspl.USPLPolicy as policy; {self.policy_class} was given.")
-        if not issubclass(self.rollout_buffer_class or USPLRolloutBuffer, USPLRolloutBuffer):
-            raise ValueError(f"USPLPPO needs a subclass of USPLRolloutBuffer; {self.rollout_buffer_class} was given.")
-        if self.blur_noise not in ("uniform", "gaussian"):
-            raise ValueError(f"blur_noise='{self.blur_noise}': choose 'uniform' or 'gaussian'.")
-        assert self.discrete_privileged is not None
-        for dim, values in self.discrete_privileged.items():
-            if not 0 <= dim < space.shape[0]:
-                raise ValueError(
-                    f"discrete_privileged names dimension {dim}, but the privileged observation has {space.shape[0]}"
-                )
-            if len(set(values)) < 2 or min(values) < space.low[dim] - 1e-6 or max(values) > space.high[dim] + 1e-6:
-                raise ValueError(
-                    f"discrete_privileged={{{dim}: {values}}}: give at least two different values within the bounds "
-                    f"[{space.low[dim]}, {space.high[dim]}] of that dimension."
-                )
-        continuous = [dim for dim in range(space.shape[0]) if dim not in self.discrete_privileged]
-        bounded = np.isfinite(space.low[continuous]) & np.isfinite(space.high[continuous])
-        if self.blur and self.blur_noise == "uniform" and not bounded.all():
-            raise ValueError(
-                f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give "
-                "them finite bounds, or use blur_noise='gaussian'."
-            )
-        n_action = get_flattened_obs_dim(self.action_space)
-        if self.action_std is not None:
-            stds = np.asarray(self.action_std, dtype=float)
-            if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():
-                raise ValueError(
-                    f"action_std={self.action_std}: give one positive number, or one for each of the {n_action} action values."
-                )
-        ranges = {
-            "warmup_timesteps": (self.warmup_timesteps or 0, 0, np.inf),
-            "ramp_timesteps": (self.ramp_timesteps or 0, 0, np.inf),
-            "blur_gain": (self.blur_gain, 0, np.inf),
-            "blur_hold_time": (self.blur_hold_time, 0, np.inf),
-            "smoothing_time": (self.smoothing_time, 0, np.inf),
-            "action_noise_time": (self.action_noise_time, 0, np.inf),
-            "action_noise_timesteps": (self.action_noise_timesteps, 0, np.inf),
-            "c_max": (self.c_max, 0, np.inf),
-            "delta": (self.delta, 0, np.inf),
-            "encoder_updates": (self.encoder_updates, 0, np.inf),
-            "encoder_batch_size": (self.encoder_batch_size, 1, np.inf),
-            "context_length": (self.context_length, 1, np.inf),
-            "encoder_beta": (self.encoder_beta, 0, 1),
-            "wander_share_matched": (self.wander_share_matched, 0, 1),
-            "wander_share": (self.wander_share, 0, 1),
-            "mismatch_fraction": (self.mismatch_fraction or 0.0, 0, 0.9),
-            "decision_period": (1.0 if self.decision_period is None else self.decision_period, 1e-6, np.inf),
-        }
-        for name, (value, low, high) in ranges.items():
-            if not low <= value <= high:
-                raise ValueError(f"{name}={value} is outside of its range [{low}, {high}].")
-
-    def _count_mismatched(self) -> int:
-        automatic = self.mismatch_fraction is None
-        fraction = 0.25 if self.mismatch_fraction is None else self.mismatch_fraction
-        count = round(fraction * self.n_envs)
-        if fraction == 0.0 or count >= 2:
-            return count
-        needed = int(np.ceil(1.5 / fraction))
-        if automatic:
-            warnings.warn(
-                f"{self.n_envs} environment(s) are too few to give some a mismatched privileged observation, without which "
-                "the encoder may learn to read it off the policy's behaviour (App. C.3.1). Use at least "
-                f"{needed}, or silence this with mismatch_fraction=0."
-            )
-            return 0
-        raise ValueError(
-            f"mismatch_fraction={fraction} of {self.n_envs} environment(s) is no pair to swap privileged observations: "
-            f"use n_envs >= {needed}, a larger fraction, or mismatch_fraction=0."
-        )
-
-    def _in_decisions(self, name: str) -> tuple[float, float] | None:
-        """Least and greatest time of that argument, in decisions."""
-        times = getattr(self, name)
-        if times is None:
-            return None
-        if not (isinstance(times, list | tuple) and len(times) == 2 and 0.0 < times[0] <= times[1]):
-            raise ValueError(f"{name}={times!r}: give the least and the greatest time in s as two positive numbers.")
-        low, high = (time / self.decision_period for time in times)  # type: ignore[operator]
-        return max(low, 1.0), max(high, 1.0)
-
-    def _ask_discrete_privileged(self) -> dict[int, list[float]]:
-        given = self.discrete_privileged
-        # Asked for first, because a missing attribute ends a worker of SubprocVecEnv.
-        if given is None and self.env is not None and self.env.has_attr("discrete_privileged"):
-            given = self.env.get_attr("discrete_privileged", indices=[0])[0]
-        return {int(dim): [float(value) for value in values] for dim, values in (given or {}).items()}
-
-    def _ask_decision_period(self) -> float:
-        if self.decision_period is not None:
-            return self.decision_period
-        if self.env is not None:
-            try:
-                return float(self.env.get_attr("decision_period", indices=[0])[0])
-            except AttributeError:
-                pass
-        return PAPER_DECISION_PERIOD
+        check_arguments(self)
 
     # -- training ----------------------------------------------------------------------------------------------------------
 
