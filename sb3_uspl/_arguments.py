@@ -1,0 +1,153 @@
+"""What ``USPLPPO`` is given: checked before anything is built, and completed from the environments and in decisions."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_uspl.buffers import USPLRolloutBuffer
+from sb3_uspl.observations import PRIVILEGED, check_observation_space
+from sb3_uspl.policies import USPLPolicy
+
+if TYPE_CHECKING:
+    from sb3_uspl.uspl_ppo import USPLPPO
+
+PAPER_DECISION_PERIOD = 0.02
+"""s; assumed for an environment that does not say how long a decision lasts."""
+
+
+def check_arguments(model: "USPLPPO") -> None:
+    """
+    Refuse what cannot be trained with, before anything is built from it.
+
+    :param model: with its arguments and spaces, and ``discrete_privileged`` looked up
+    :raises ValueError: for a space outside the contract or an argument outside its range, naming what to do
+    """
+    space = check_observation_space(model.observation_space)[PRIVILEGED]
+    assert isinstance(space, spaces.Box)
+    if not issubclass(model.policy_class, USPLPolicy):
+        raise ValueError(f"USPLPPO needs a subclass of sb3_uspl.USPLPolicy as policy; {model.policy_class} was given.")
+    if not issubclass(model.rollout_buffer_class or USPLRolloutBuffer, USPLRolloutBuffer):
+        raise ValueError(f"USPLPPO needs a subclass of USPLRolloutBuffer; {model.rollout_buffer_class} was given.")
+    if model.blur_noise not in ("uniform", "gaussian"):
+        raise ValueError(f"blur_noise='{model.blur_noise}': choose 'uniform' or 'gaussian'.")
+    assert model.discrete_privileged is not None
+    for dim, values in model.discrete_privileged.items():
+        if not 0 <= dim < space.shape[0]:
+            raise ValueError(f"discrete_privileged names dimension {dim}, but the privileged observation has {space.shape[0]}")
+        if len(set(values)) < 2 or min(values) < space.low[dim] - 1e-6 or max(values) > space.high[dim] + 1e-6:
+            raise ValueError(
+                f"discrete_privileged={{{dim}: {values}}}: give at least two different values within the bounds "
+                f"[{space.low[dim]}, {space.high[dim]}] of that dimension."
+            )
+    continuous = [dim for dim in range(space.shape[0]) if dim not in model.discrete_privileged]
+    bounded = np.isfinite(space.low[continuous]) & np.isfinite(space.high[continuous])
+    if model.blur and model.blur_noise == "uniform" and not bounded.all():
+        raise ValueError(
+            f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give "
+            "them finite bounds, or use blur_noise='gaussian'."
+        )
+    n_action = get_flattened_obs_dim(model.action_space)
+    if model.action_std is not None:
+        stds = np.asarray(model.action_std, dtype=float)
+        if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():
+            raise ValueError(
+                f"action_std={model.action_std}: give one positive number, or one for each of the {n_action} action values."
+            )
+    ranges = {
+        "warmup_timesteps": (model.warmup_timesteps or 0, 0, np.inf),
+        "ramp_timesteps": (model.ramp_timesteps or 0, 0, np.inf),
+        "blur_gain": (model.blur_gain, 0, np.inf),
+        "blur_hold_time": (model.blur_hold_time, 0, np.inf),
+        "smoothing_time": (model.smoothing_time, 0, np.inf),
+        "action_noise_time": (model.action_noise_time, 0, np.inf),
+        "action_noise_timesteps": (model.action_noise_timesteps, 0, np.inf),
+        "c_max": (model.c_max, 0, np.inf),
+        "delta": (model.delta, 0, np.inf),
+        "encoder_updates": (model.encoder_updates, 0, np.inf),
+        "encoder_batch_size": (model.encoder_batch_size, 1, np.inf),
+        "context_length": (model.context_length, 1, np.inf),
+        "encoder_beta": (model.encoder_beta, 0, 1),
+        "wander_share_matched": (model.wander_share_matched, 0, 1),
+        "wander_share": (model.wander_share, 0, 1),
+        "mismatch_fraction": (model.mismatch_fraction or 0.0, 0, 0.9),
+        "decision_period": (1.0 if model.decision_period is None else model.decision_period, 1e-6, np.inf),
+    }
+    for name, (value, low, high) in ranges.items():
+        if not low <= value <= high:
+            raise ValueError(f"{name}={value} is outside of its range [{low}, {high}].")
+
+
+def count_mismatched(fraction: float | None, n_envs: int) -> int:
+    """
+    How many environments are shown another one's privileged observation.
+
+    :param fraction: of the environments; None: a quarter, or none with a warning if that is no pair
+    :param n_envs: number of environments
+    :raises ValueError: if a fraction that was asked for is no pair
+    """
+    automatic = fraction is None
+    fraction = 0.25 if fraction is None else fraction
+    count = round(fraction * n_envs)
+    if fraction == 0.0 or count >= 2:
+        return count
+    needed = int(np.ceil(1.5 / fraction))
+    if automatic:
+        warnings.warn(
+            f"{n_envs} environment(s) are too few to give some a mismatched privileged observation, without which the encoder "
+            f"may learn to read it off the policy's behaviour (App. C.3.1). Use at least {needed}, or silence this with "
+            "mismatch_fraction=0."
+        )
+        return 0
+    raise ValueError(
+        f"mismatch_fraction={fraction} of {n_envs} environment(s) is no pair to swap privileged observations: "
+        f"use n_envs >= {needed}, a larger fraction, or mismatch_fraction=0."
+    )
+
+
+def in_decisions(name: str, times: tuple[float, float], decision_period: float) -> tuple[float, float]:
+    """
+    Least and greatest time in decisions, at least one.
+
+    :param name: of the argument
+    :param times: least and greatest, s
+    :param decision_period: s
+    :raises ValueError: if they are no range of times
+    """
+    if not (isinstance(times, list | tuple) and len(times) == 2 and 0.0 < times[0] <= times[1]):
+        raise ValueError(f"{name}={times!r}: give the least and the greatest time in s as two positive numbers.")
+    low, high = (time / decision_period for time in times)
+    return max(low, 1.0), max(high, 1.0)
+
+
+def ask_discrete_privileged(env: VecEnv | None, given: dict[int, list[float]] | None) -> dict[int, list[float]]:
+    """
+    Values of the discrete privileged dimensions.
+
+    :param env: asked if nothing is given
+    :param given: what the user says
+    """
+    # Asked for first, because a missing attribute ends a worker of SubprocVecEnv.
+    if given is None and env is not None and env.has_attr("discrete_privileged"):
+        given = env.get_attr("discrete_privileged", indices=[0])[0]
+    return {int(dim): [float(value) for value in values] for dim, values in (given or {}).items()}
+
+
+def ask_decision_period(env: VecEnv | None, given: float | None) -> float:
+    """
+    How long a decision lasts, s.
+
+    :param env: asked if nothing is given
+    :param given: what the user says
+    """
+    if given is not None:
+        return given
+    if env is not None:
+        try:
+            return float(env.get_attr("decision_period", indices=[0])[0])
+        except AttributeError:
+            pass
+    return PAPER_DECISION_PERIOD
