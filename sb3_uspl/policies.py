@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 from torch import nn
 
-from sb3_uspl.distributions import CorrelatedGaussianDistribution
+from sb3_uspl.distributions import CorrelatedGaussianDistribution, recoverable_tanh
 from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, encode_actions, reset_rows
 from sb3_uspl.observations import (
     BELIEF,
@@ -119,8 +119,8 @@ class USPLPolicy(ActorCriticPolicy):
     :param normalize_common: whether actor and critic see the common observation with zero mean and unit variance: a corridor's
         width in units of the whole arena would otherwise take PPO long to notice
     :param bounded_mean: whether the mean of continuous actions is squashed into the action space by a tanh, as in the authors'
-        release. Without it the mean drifts beyond the bounds, where sampling changes nothing any more and a habit of the
-        warm-up cannot be unlearned.
+        release, with the gradient of ``recoverable_tanh``. Without it the mean drifts beyond the bounds, where sampling
+        changes nothing any more and a habit of the warm-up cannot be unlearned.
     :param noise_correlation: of the noise of continuous actions from one decision to the next, see
         ``CorrelatedGaussianDistribution``
     :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
@@ -214,7 +214,7 @@ class USPLPolicy(ActorCriticPolicy):
         if not self.bounded_mean:
             return super()._get_action_dist_from_latent(latent_pi)
         assert isinstance(self.action_dist, DiagGaussianDistribution)
-        mean = self.action_centre + self.action_half_range * th.tanh(self.action_net(latent_pi))
+        mean = self.action_centre + self.action_half_range * recoverable_tanh(self.action_net(latent_pi))
         return self.action_dist.proba_distribution(mean, self.log_std)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:

@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_uspl.baselines.sequences import EMBEDDING, HistoryEncoder, SequenceBatch
+from sb3_uspl.distributions import recoverable_tanh
 from sb3_uspl.encoder import RunningNormalizer, Tokens, encode_actions, reset_rows
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_observation_space
 from sb3_uspl.policies import PolicyFeatures, USPLPolicy
@@ -130,7 +131,7 @@ class RESeLPolicy(ActorCriticPolicy):
         if not self.bounded_mean:
             return super()._get_action_dist_from_latent(latent_pi)
         assert isinstance(self.action_dist, DiagGaussianDistribution)
-        mean = self.action_centre + self.action_half_range * th.tanh(self.action_net(latent_pi))
+        mean = self.action_centre + self.action_half_range * recoverable_tanh(self.action_net(latent_pi))
         return self.action_dist.proba_distribution(mean, self.log_std)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
