@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_uspl.baselines import RESeLPolicy
 from sb3_uspl.baselines.sequences import EMBEDDING
-from sb3_uspl.encoder.memory import GRUMemory, Memory, MemoryState, TransformerMemory
+from sb3_uspl.encoder.memory import MEMORIES, GRUMemory, MaxMemory, Memory, MemoryState, TransformerMemory
 from sb3_uspl.observations import BELIEF, COMMON, PREVIOUS_ACTION, PRIVILEGED, TARGET, TRUTH, UNCERTAINTY
 from sb3_uspl.policies import USPLPolicy
 from sb3_uspl.uncertainty import INITIAL_STD
@@ -181,6 +181,21 @@ class _GRUStep(nn.Module):
         return after, (after,)
 
 
+class _MaxStep(nn.Module):
+    """
+    One step of a running maximum.
+
+    :param memory: whose weights are taken
+    """
+
+    names = ("memory",)
+
+    def __init__(self, memory: MaxMemory):
+        super().__init__()
+        self.initial_state, self.step = memory.initial_state, memory.step
+        self.weights = memory
+
+
 class _TransformerStep(nn.Module):
     """
     One step of a Transformer whose keys and values lie in a ring of fixed size: the newest takes the place of the oldest.
@@ -225,9 +240,11 @@ def _frozen_copy(policy: nn.Module) -> Any:
     return copy.deepcopy(policy).to("cpu").requires_grad_(False)
 
 
-def _as_function(memory: Memory, horizon: int) -> _GRUStep | _TransformerStep:
+def _as_function(memory: Memory, horizon: int) -> _GRUStep | _MaxStep | _TransformerStep:
     if isinstance(memory, GRUMemory):
         return _GRUStep(memory)
+    if isinstance(memory, MaxMemory):
+        return _MaxStep(memory)
     if isinstance(memory, TransformerMemory):
         return _TransformerStep(memory, horizon)
-    raise ValueError(f"{type(memory).__name__} cannot be exported; the memories 'gru' and 'transformer' can.")
+    raise ValueError(f"{type(memory).__name__} cannot be exported; the memories {sorted(MEMORIES)} can.")

@@ -12,6 +12,7 @@ from benchmarks import encoder, environments, gpu, growth, harness, phases, star
 from benchmarks.contenders import METHODS, HidePrivileged, build, hides_privileged, make_venv, memory_width, zoo_settings
 from benchmarks.synthetic import SyntheticEnv
 from sb3_uspl import USPLPPO
+from sb3_uspl.encoder import MEMORIES
 
 LATERAL_CHOICE = training.Task("LateralChoice-v0", {"physics": "compiled"}, 8)
 ONE_EPISODE = 8 * 80
@@ -234,9 +235,7 @@ def test_encoder():
     rollout, update, targets = tables.values()
     check_table(rollout, "us / token")
     check_table(update, "tokens / s")
-    assert [row["what"] for row in targets] == [
-        f"{m}, 8 envs: a token at position 500 / at 10" for m in ("gru", "transformer")
-    ]
+    assert [row["what"] for row in targets] == [f"{memory}, 8 envs: a token at position 500 / at 10" for memory in MEMORIES]
 
 
 def test_training(monkeypatch):
@@ -263,7 +262,7 @@ def test_growth():
     (table,) = growth.run(1, (1, 8), (4,), (8,), (None, 16), n_envs=8, length=4).values()
     check_table(table, "us / decision")
     assert all(0.0 < row["of which rollout"] < row["median"] for row in table)
-    assert len(table) == 2 + 2 + 2 * (1 + 1)
+    assert len(table) == 2 + 2 + len(MEMORIES) * (1 + 1)
 
 
 def test_gpu_section_runs_anywhere_but_shows_nothing_without_one():
