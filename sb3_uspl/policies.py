@@ -111,6 +111,8 @@ class USPLPolicy(ActorCriticPolicy):
     :param encoder: preset of the encoder, "small" or "paper" (App. C.3.3)
     :param memory: the encoder's memory, "gru", "transformer" or "max"
     :param encoder_kwargs: replaces single entries of the preset
+    :param discrete_privileged: discrete dimensions of the privileged observation and their values, for an encoder with
+        ``encoder_kwargs=dict(categorical=True)``
     :param encoder_learning_rate: initial learning rate of the encoder
     :param encoder_weight_decay: weight decay of the encoder (Tables 4 and 5)
     :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)
@@ -139,6 +141,7 @@ class USPLPolicy(ActorCriticPolicy):
         encoder: str = "small",
         memory: str = "gru",
         encoder_kwargs: dict[str, Any] | None = None,
+        discrete_privileged: dict[int, list[float]] | None = None,
         encoder_learning_rate: float = 1e-3,
         encoder_weight_decay: float = 0.0,
         uncertainty_input: bool = True,
@@ -155,6 +158,7 @@ class USPLPolicy(ActorCriticPolicy):
             encoder=encoder,
             memory=memory,
             encoder_kwargs=encoder_kwargs,
+            discrete_privileged=discrete_privileged,
             encoder_learning_rate=encoder_learning_rate,
             encoder_weight_decay=encoder_weight_decay,
             bounded_mean=bounded_mean,
@@ -194,7 +198,7 @@ class USPLPolicy(ActorCriticPolicy):
         self.smoothing = smoothing
         n_action = get_flattened_obs_dim(action_space)
         with th.random.fork_rng(devices=[]):  # leaves the random numbers of the actions as they are in stock PPO
-            self.encoder = ObservationEncoder(self.contract, n_action, encoder, memory, encoder_kwargs)
+            self.encoder = ObservationEncoder(self.contract, n_action, encoder, memory, encoder_kwargs, discrete_privileged)
         self.encoder_optimizer = th.optim.AdamW(
             self.encoder.parameters(), lr=encoder_learning_rate, weight_decay=encoder_weight_decay
         )

@@ -24,7 +24,6 @@ from sb3_uspl._arguments import (
 )
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
-from sb3_uspl.encoder import Belief, gaussian_nll
 from sb3_uspl.observations import COMMON
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
@@ -272,6 +271,7 @@ class USPLPPO(PPO):
             **self.policy_kwargs,
             "uncertainty_input": self.uncertainty_input,
             "mean_input": self.mean_input,
+            "discrete_privileged": self.discrete_privileged,
             "smoothing": smoothing,
             "noise_correlation": smoothing_factor(self.action_noise_time, self.decision_period),
             "encoder_learning_rate": self.encoder_lr_schedule(1.0),
@@ -441,19 +441,23 @@ class USPLPPO(PPO):
                 encoder.features.update_normalizers(tokens)
             with th.autocast(self.device.type, th.bfloat16, enabled=self.encoder_bf16):
                 belief, _ = forward(tokens, lengths)
-            belief = Belief(belief.mean.float(), belief.log_std.float())
-            loss = gaussian_nll(belief, truth, self.encoder_beta)
+            belief = belief.float()
+            loss = encoder.loss(belief, truth, self.encoder_beta)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             th.nn.utils.clip_grad_norm_(encoder.parameters(), self.encoder_max_grad_norm)
             optimizer.step()
             with th.no_grad():
-                metrics.append(th.stack((gaussian_nll(belief, truth), (belief.mean - truth).abs().mean(), belief.std.mean())))
+                error = (belief.mean - truth).abs().mean()
+                numbers = (encoder.loss(belief, truth), error, belief.std.mean(), encoder.accuracy(belief, truth))
+                metrics.append(th.stack(numbers))
         # PPO clips the gradients of the whole policy; the encoder's must not be among them.
         optimizer.zero_grad(set_to_none=True)
         if metrics:
-            for name, value in zip(("nll", "error", "std"), th.stack(metrics).mean(0).tolist(), strict=True):
-                self.logger.record(f"encoder/{name}", value)
+            names = ("nll", "error", "std", "accuracy")
+            for name, value in zip(names, th.stack(metrics).mean(0).tolist(), strict=True):
+                if name != "accuracy" or encoder.discrete:
+                    self.logger.record(f"encoder/{name}", value)
 
     # -- saving ------------------------------------------------------------------------------------------------------------
 

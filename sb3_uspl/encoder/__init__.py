@@ -1,6 +1,15 @@
 """Observation encoder: features (MLP, CNN), memory (GRU, Transformer with KV cache), belief head (mean, std)."""
 
-from sb3_uspl.encoder.encoder import MAX_STD, MIN_STD, PRESETS, Belief, ObservationEncoder, gaussian_nll, soft_clamp
+from sb3_uspl.encoder.encoder import (
+    MAX_STD,
+    MIN_STD,
+    PRESETS,
+    Belief,
+    DiscreteHead,
+    ObservationEncoder,
+    gaussian_nll,
+    soft_clamp,
+)
 from sb3_uspl.encoder.features import FourierFeatures, ImageCNN, RunningNormalizer, TokenFeatures, Tokens, encode_actions
 from sb3_uspl.encoder.memory import MEMORIES, GRUMemory, Memory, MemoryState, TransformerMemory, reset_rows, take_rows
 
@@ -10,6 +19,7 @@ __all__ = [
     "MIN_STD",
     "PRESETS",
     "Belief",
+    "DiscreteHead",
     "FourierFeatures",
     "GRUMemory",
     "ImageCNN",

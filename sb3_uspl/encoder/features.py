@@ -95,20 +95,28 @@ class FourierFeatures(nn.Module):
     A metre in a maze of eight is a small part of the input's range, and an MLP takes long to find a sharp edge there.
 
     :param frequencies: number of octaves; 0 leaves the inputs as they are
+    :param inputs: indices of the inputs that have sines and cosines; None: all
     """
 
-    def __init__(self, frequencies: int):
+    def __init__(self, frequencies: int, inputs: Sequence[int] | None = None):
         super().__init__()
         self.frequencies = frequencies
-        self.factor = 1 + 2 * frequencies
-        """Features per input."""
+        self.inputs = None if inputs is None else list(inputs)
+
+    def width(self, n_inputs: int) -> int:
+        """
+        :param n_inputs: number of inputs
+        :return: number of features
+        """
+        return n_inputs + 2 * self.frequencies * (n_inputs if self.inputs is None else len(self.inputs))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
         :param x: ``(..., n_inputs)``, of about unit variance
-        :return: ``(..., n_inputs * factor)``
+        :return: ``(..., width(n_inputs))``
         """
-        angles = [x * (0.5 * math.pi * 2.0**octave) for octave in range(self.frequencies)]
+        chosen = x if self.inputs is None else x[..., self.inputs]
+        angles = [chosen * (0.5 * math.pi * 2.0**octave) for octave in range(self.frequencies)]
         return th.cat([x, *[f(angle) for angle in angles for f in (th.sin, th.cos)]], dim=-1)
 
 
@@ -186,7 +194,10 @@ class TokenFeatures(nn.Module):
     :param image_layers: its fully connected layers
     :param extremes: whether a vector target's least and greatest value are inputs of their own beside the common
         observation: of scandots, how high the highest thing in sight is, which an MLP over all points takes long to find
-    :raises ValueError: if the image is too small for the convolutions
+    :param fourier_inputs: indices of the common observation's numbers that have Fourier features; None: all, and the action
+    :param normalize: whether the common observation and the action are brought to zero mean and unit variance. Where little
+        of what varies matters, as a few centimetres of jitter beside a reading, their own scale tells the encoder more.
+    :raises ValueError: if the image is too small for the convolutions, or there are no such ``fourier_inputs``
     """
 
     def __init__(
@@ -199,6 +210,8 @@ class TokenFeatures(nn.Module):
         convolutions: Convolutions = (),
         image_layers: Sequence[int] = (128, 128),
         extremes: bool = False,
+        fourier_inputs: Sequence[int] | None = None,
+        normalize: bool = True,
     ):
         super().__init__()
         common, target = space[COMMON], space.spaces.get(TARGET)
@@ -207,9 +220,13 @@ class TokenFeatures(nn.Module):
         self.has_vector_target = target is not None and not self.has_image
         self.extremes = extremes and self.has_vector_target
         n_common = common.shape[0] + n_action + 2 * self.extremes
-        self.common_normalizer = RunningNormalizer(n_common)
-        self.common_fourier = FourierFeatures(frequencies)
-        self.common = mlp(n_common * self.common_fourier.factor, hidden)
+        if not all(0 <= index < common.shape[0] for index in fourier_inputs or ()):
+            raise ValueError(
+                f"fourier_inputs={fourier_inputs}: indices of the common observation, which has {common.shape[0]} numbers."
+            )
+        self.common_normalizer = RunningNormalizer(n_common) if normalize else None
+        self.common_fourier = FourierFeatures(frequencies, fourier_inputs)
+        self.common = mlp(self.common_fourier.width(n_common), hidden)
         width = hidden[-1]
         if self.has_image:
             assert isinstance(target, spaces.Box)
@@ -227,7 +244,8 @@ class TokenFeatures(nn.Module):
         """
         :param tokens: a batch of unpadded tokens, ``(n_tokens, ...)``
         """
-        self.common_normalizer.update(self._common_vector(tokens))
+        if self.common_normalizer is not None:
+            self.common_normalizer.update(self._common_vector(tokens))
         if self.has_vector_target:
             self.target_normalizer.update(tokens[TARGET].float())
 
@@ -236,7 +254,10 @@ class TokenFeatures(nn.Module):
         :param tokens: ``(..., *shape of the key)``
         :return: ``(..., width)``
         """
-        parts = [self.common(self.common_fourier(self.common_normalizer(self._common_vector(tokens))))]
+        vector = self._common_vector(tokens)
+        if self.common_normalizer is not None:
+            vector = self.common_normalizer(vector)
+        parts = [self.common(self.common_fourier(vector))]
         if self.has_vector_target:
             parts.append(self.target(self.target_normalizer(tokens[TARGET].float())))
         if self.has_image:

@@ -117,6 +117,26 @@ def test_a_loaded_model_still_knows(tmp_path):
     assert loaded._uncertainty_config.discrete_privileged == {1: VALUES}
 
 
+def test_a_categorical_belief_is_learned_saved_and_loaded(tmp_path):
+    kwargs = dict(encoder_kwargs=dict(categorical=True))
+    model = USPLPPO("MlpPolicy", make_vec_env(MixedEnv, 4), policy_kwargs=kwargs, **FAST)
+    before = model.policy.encoder.discrete["1"].logits[-1].weight.detach().clone()
+    model.learn(128)
+    assert "discrete_privileged" not in model.policy_kwargs
+    head = model.policy.encoder.discrete["1"]
+    assert head.values.tolist() == VALUES and not th.equal(head.logits[-1].weight, before)
+    model.save(tmp_path / "model")
+    env = MixedEnv()
+    obs, _ = env.reset(seed=0)
+    for loaded in (USPLPPO.load(tmp_path / "model"), USPLPPO.load(tmp_path / "model", make_vec_env(MixedEnv, 4))):
+        for ours, theirs in zip(
+            model.predict(obs, deterministic=True)[1][:2], loaded.predict(obs, deterministic=True)[1][:2], strict=True
+        ):
+            np.testing.assert_array_equal(ours, theirs)
+    with pytest.raises(ValueError, match="discrete_privileged"):
+        USPLPPO("MlpPolicy", make_vec_env(ToyEnv, 4), policy_kwargs=kwargs, **FAST)
+
+
 def test_the_arm_is_learned_on_through_its_mixed_privileged_observation():
     venv = make_vec_env("BlindMassStack-v0", 8, env_kwargs=dict(physics="compiled"), vec_env_cls=BulletVecEnv)
     model = USPLPPO("MultiInputPolicy", venv, warmup_timesteps=0, ramp_timesteps=0, **FAST)

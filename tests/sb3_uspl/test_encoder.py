@@ -13,6 +13,7 @@ from sb3_uspl.encoder import (
     MEMORIES,
     MIN_STD,
     Belief,
+    DiscreteHead,
     FourierFeatures,
     ObservationEncoder,
     RunningNormalizer,
@@ -145,10 +146,18 @@ def test_fourier_features_tell_apart_what_is_close():
     features = FourierFeatures(4)
     near = th.tensor([[1.0], [1.1]])
     plain, rich = FourierFeatures(0)(near), features(near)
-    assert rich.shape == (2, features.factor) == (2, 9)
+    assert rich.shape == (2, features.width(1)) == (2, 9)
     th.testing.assert_close(rich[:, :1], plain)
     th.testing.assert_close(rich[0, 1], th.sin(th.tensor(0.5 * math.pi)))
     assert (rich[0] - rich[1]).norm() > 10 * (plain[0] - plain[1]).norm()
+
+
+def test_fourier_features_of_some_inputs_leave_the_others_as_they_are():
+    features, x = FourierFeatures(3, [2]), th.randn(5, 4)
+    rich = features(x)
+    assert rich.shape == (5, features.width(4)) == (5, 10)
+    th.testing.assert_close(rich[:, :4], x)
+    th.testing.assert_close(rich[:, 4:], FourierFeatures(3)(x[:, 2:3])[:, 1:])
 
 
 def test_soft_clamp_stays_inside_and_keeps_a_gradient():
@@ -164,6 +173,105 @@ def test_untrained_belief_is_wide_and_centred():
     encoder = ObservationEncoder(ToyEnv().observation_space, 1)
     belief, _ = encoder.step({"common": th.randn(4, 2), "previous_action": th.randn(4, 1)}, encoder.memory.initial_state(4))
     assert belief.mean.abs().max() < 0.1 and (belief.std - 0.5).abs().max() < 0.05
+
+
+VALUES = (-0.3, 0.0, 0.3)
+
+
+def categorical_encoder(memory="gru", **overrides):
+    th.manual_seed(0)
+    space = ToyEnv(n_privileged=3).observation_space
+    return ObservationEncoder(space, 1, "small", memory, {"categorical": True, **overrides}, {1: VALUES})
+
+
+def test_a_categorical_belief_has_the_moments_of_its_distribution():
+    head = DiscreteHead(th.nn.Identity(), VALUES)
+    log_probs = head(th.log(th.tensor([[0.2, 0.3, 0.5], [0.5, 0.0, 0.5], [0.0, 1.0, 0.0]])))
+    th.testing.assert_close(log_probs.exp().sum(-1), th.ones(3))
+    mean, log_std = head.moments(log_probs)
+    th.testing.assert_close(mean, th.tensor([0.09, 0.0, 0.0]))
+    variance = th.tensor([0.2 * 0.39**2 + 0.3 * 0.09**2 + 0.5 * 0.21**2, 0.09, 0.0])
+    th.testing.assert_close(log_std.exp(), th.sqrt(variance + MIN_STD**2))
+    assert head.index(th.tensor([0.3, -0.29, 0.01])).tolist() == [2, 0, 1]
+
+
+def test_the_loss_of_a_mixed_belief_is_gaussian_and_cross_entropy():
+    encoder = categorical_encoder()
+    tokens = {"common": th.randn(6, 2), "previous_action": th.randn(6, 1)}
+    truth = th.tensor([[0.1, value, -0.2] for value in (*VALUES, *VALUES)])
+    belief, _ = encoder(tokens, th.tensor([4, 2]))
+    gaussian = Belief(belief.mean[:, [0, 2]], belief.log_std[:, [0, 2]])
+    for beta in (0.0, 0.75):
+        of_true_values = belief.log_probs[0][th.arange(6), [0, 1, 2, 0, 1, 2]]
+        expected = gaussian_nll(gaussian, truth[:, [0, 2]], beta) - of_true_values.mean()
+        th.testing.assert_close(encoder.loss(belief, truth, beta), expected)
+    mean, log_std = encoder.discrete["1"].moments(belief.log_probs[0])
+    th.testing.assert_close((belief.mean[:, 1], belief.log_std[:, 1]), (mean, log_std))
+    best = th.tensor(VALUES)[belief.log_probs[0].argmax(-1)]
+    assert encoder.accuracy(belief, truth).item() == pytest.approx((best == truth[:, 1]).float().mean().item())
+
+
+def test_without_categorical_the_loss_is_eq_1():
+    th.manual_seed(0)
+    encoder = ObservationEncoder(ToyEnv().observation_space, 1, discrete={0: VALUES})
+    belief, _ = encoder({"common": th.randn(5, 2), "previous_action": th.randn(5, 1)}, th.tensor([5]))
+    truth = th.randn(5, 1)
+    assert belief.log_probs == () and not any("discrete" in name for name in encoder.state_dict())
+    th.testing.assert_close(encoder.loss(belief, truth, 0.5), gaussian_nll(belief, truth, 0.5))
+    assert encoder.accuracy(belief, truth).isnan()
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_categorical_beliefs_step_by_step_are_those_of_whole_episodes(memory):
+    encoder = categorical_encoder(memory)
+    tokens = {"common": th.randn(6, 2), "previous_action": th.randn(6, 1)}
+    with th.no_grad():
+        whole, _ = encoder(tokens, th.tensor([6]))
+        state = encoder.memory.initial_state(1)
+        for t in range(6):
+            belief, state = encoder.step({key: value[t : t + 1] for key, value in tokens.items()}, state)
+            th.testing.assert_close(belief.mean[0], whole.mean[t])
+            th.testing.assert_close(belief.std[0], whole.std[t])
+
+
+def test_a_categorical_belief_learns_a_value_between_others():
+    """The sign of a product says whether it is the middle value or one of the others, and nothing says which."""
+    encoder = categorical_encoder("max", hidden=(32,), trunk=(32,), embedding=(32,), orthogonal=True)
+    optimizer = th.optim.Adam(encoder.parameters(), 3e-3)
+    common = th.randn(512, 2)
+    index = th.where(common.prod(-1) > 0.0, 1, 2 * th.randint(0, 2, (512,)))
+    truth = 0.2 * th.randn(512, 3)
+    truth[:, 1] = th.tensor(VALUES)[index]
+    tokens, lengths = {"common": common, "previous_action": th.zeros(512, 1)}, th.ones(512, dtype=th.long)
+    for _ in range(100):
+        loss = encoder.loss(encoder(tokens, lengths)[0], truth)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    std = encoder(tokens, lengths)[0].std[:, 1]
+    assert std[index == 1].mean() < 0.1 and std[index != 1].mean() > 0.2
+
+
+def test_an_orthogonal_start_keeps_lengths_up_to_its_gain():
+    for memory in MEMORIES:
+        encoder = categorical_encoder(memory, orthogonal=True)
+        layers = [encoder.features.trunk[0], encoder.embedding[0]]
+        layers += [encoder.memory.notice, encoder.memory.out] if memory == "max" else []
+        for layer in layers:
+            weight = layer.weight.detach() if layer.in_features >= layer.out_features else layer.weight.detach().t()
+            th.testing.assert_close(weight @ weight.t(), 2.0 * th.eye(len(weight)), atol=1e-4, rtol=0.0)
+            assert (layer.bias == 0.0).all()
+
+
+def test_without_normalisation_the_common_observation_keeps_its_scale():
+    encoder = categorical_encoder(normalize=False, frequencies=0)
+    tokens = {"common": 100.0 * th.randn(50, 2), "previous_action": th.randn(50, 1)}
+    features = encoder.features
+    before = features(tokens)
+    features.update_normalizers(tokens)
+    th.testing.assert_close(features(tokens), before)
+    vector = th.cat((tokens["common"], tokens["previous_action"]), -1)
+    th.testing.assert_close(features.trunk(features.common(vector)), before)
 
 
 def test_normalizer_statistics_equal_those_of_all_data():
@@ -195,9 +303,18 @@ def test_the_paper_preset_has_the_papers_transformer():
     assert (memory.n_heads, memory.head_width, memory.width) == (16, 64, 256)
 
 
-@pytest.mark.parametrize("kwargs", [{"preset": "huge"}, {"memory": "lstm"}, {"overrides": {"depth": 3}}])
-def test_unknown_architecture_is_refused(kwargs):
-    with pytest.raises(ValueError, match=r"presets are|unknown entries"):
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"preset": "huge"},
+        {"memory": "lstm"},
+        {"overrides": {"depth": 3}},
+        {"overrides": {"categorical": True}},
+        {"overrides": {"fourier_inputs": (0, 2)}},
+    ],
+)
+def test_impossible_architecture_is_refused(kwargs):
+    with pytest.raises(ValueError, match=r"presets are|unknown entries|discrete_privileged|which has 2 numbers"):
         ObservationEncoder(ToyEnv().observation_space, 1, **kwargs)
 
 

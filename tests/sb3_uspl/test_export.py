@@ -29,20 +29,22 @@ CASES = {
     "gru": (USPLPPO, "gru", None, None),
     "transformer": (USPLPPO, "transformer", IMAGE, spaces.Discrete(3)),
     "vector": (USPLPPO, "max", VECTOR, spaces.MultiDiscrete([2, 3])),
+    "categorical": (USPLPPO, "max", None, None, {"categorical": True}),
     "resel": (RESeLPPO, "transformer", None, spaces.Box(-2, 3, (2,), np.float32)),
 }
 
 
-def make_model(algorithm=USPLPPO, memory="gru", target=None, action_space=None, normalize=False):
+def make_model(algorithm=USPLPPO, memory="gru", target=None, action_space=None, sizes=None, normalize=False):
     venv = make_vec_env(lambda: ToyEnv(length=EPISODE, target=target, action_space=action_space), 8, seed=0)
     if normalize:
         keys = ["common", "target", "privileged"] if target is not None else ["common", "privileged"]
         venv = VecNormalize(venv, norm_obs_keys=keys)
-    sizes = dict(hidden=(16,), trunk=(16,), embedding=(16,))
+    more = {} if sizes is None else dict(discrete_privileged={0: [-0.1, 0.0, 0.1]})
+    sizes = dict(hidden=(16,), trunk=(16,), embedding=(16,)) | (sizes or {})
     if algorithm is RESeLPPO:  # it hears its own continuous action: at high frequencies, untrained, rounding errors grow
         sizes["frequencies"] = 0
     kwargs = dict(memory=memory, encoder_kwargs=sizes)
-    model = algorithm("MlpPolicy", venv, n_steps=16, batch_size=64, policy_kwargs=kwargs, device="cpu", seed=0)
+    model = algorithm("MlpPolicy", venv, n_steps=16, batch_size=64, policy_kwargs=kwargs, device="cpu", seed=0, **more)
     rng = th.Generator().manual_seed(0)
     with th.no_grad():  # an untrained policy hardly acts
         for parameter in model.policy.parameters():
@@ -87,7 +89,7 @@ def load_example(path):
     return namespace["ExportedPolicy"](str(path))
 
 
-@pytest.fixture(scope="module", params=["gru", "transformer", "vector", "resel"])
+@pytest.fixture(scope="module", params=["gru", "transformer", "vector", "categorical", "resel"])
 def exported(request, tmp_path_factory):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
