@@ -38,14 +38,15 @@ _FLOOR_HEIGHT = -0.6  # m
 
 POSITION_SCALE = 0.3
 """Length that counts as 1 in the observed positions, m."""
-MASS_SCALE = 2.5
-"""Mass that counts as 1 in the observed reading, kg; the greatest reading is 2.03 kg."""
+READINGS = (0.25, 2.5)
+"""Least and greatest reading that the observation can show, kg; it lies between 0.28 and 2.03 kg."""
+READING_STEP = 0.5
+"""Of the reading's logarithm that counts as 1 in the observation: readings span 4 units, red and blue differ by 0.3-0.6."""
 INDEX_SCALE = 0.3
 """Of the red cube's index (-1, 0, 1) in the privileged observation. Its standard deviation is 0.24, and 0.21 for a robot that
 knows which cube is green."""
 BIAS_SCALE = 0.4
 """Of the logarithm of the bias, in units of its bound, in the privileged observation: a standard deviation of 0.23."""
-_N_COMMON = 20
 _ROOM = 0.13  # m between the centres of neighbours: half the hand's breadth (0.10 m), half a cube
 _ON_TOP = 0.01  # m; how much the difference of two cubes' heights may differ from an edge when one stands on the other
 
@@ -109,10 +110,16 @@ class BlindMassStackConfig:
         if not 1.0 < self.greatest_bias < math.inf:
             raise ValueError(f"`greatest_bias` must be a factor above 1, got {self.greatest_bias}.")
         greatest = self.greatest_bias * max(self.green_mass, self.red_mass * far)
-        if greatest > MASS_SCALE:
+        if greatest > READINGS[1]:
             raise ValueError(
-                f"A reading can be {greatest:.2f} kg, beyond the {MASS_SCALE} kg that the observation can show: lower "
+                f"A reading can be {greatest:.2f} kg, beyond the {READINGS[1]} kg that the observation can show: lower "
                 "`greatest_bias` or the masses."
+            )
+        least = min(self.green_mass, self.red_mass / far) / self.greatest_bias
+        if least <= READINGS[0]:
+            raise ValueError(
+                f"A reading can be {least:.2f} kg, which must be above the {READINGS[0]} kg that the observation shows as 0: "
+                "lower `greatest_bias` or raise the masses."
             )
         most = 0.5 * (self.spacing - _ROOM)
         if not 0.0 <= self.jitter <= most:
@@ -140,9 +147,11 @@ class BlindMassStack(Task):
         (log-uniform), the same all episode. Places (within 3 cm), colours, blue's mass and the factor are drawn at reset.
 
     Observation spaces
-        ``common`` Box(20): positions of the three cubes and of the hand (middle of the fingers) relative to the table below
+        ``common`` Box(22): positions of the three cubes and of the hand (middle of the fingers) relative to the table below
         the row's middle, / 0.3 m; which cube is green (one-hot, 3); whether a cube is held; which one (one-hot, 3, zeros if
-        none); reading of the scale / 2.5 kg, which is the bias times the mass while a held cube hangs free and 0 otherwise.
+        none); reading of the scale, if it is the green cube, the left or the right one of the others that is held (3, zeros
+        for the rest), as log(reading / 0.25 kg) / 0.5. The scale reads bias times mass while a held cube hangs free;
+        otherwise all three are 0.
         Cubes are numbered from left to right. ``privileged`` Box(2): index of the red cube as -0.3, 0 or 0.3, discrete
         (Eq. 4); the scale's bias as 0.4 log(bias) / log(2), continuous. Standard deviations 0.21 (to a robot that knows the
         green cube) and 0.23. There is no ``target``.
@@ -169,9 +178,10 @@ class BlindMassStack(Task):
         one onto the green one. With an average of 7 decisions; a robot that knows red needs 2.
 
     Differences from the paper
-        Decisions are whole motions instead of 20 ms steps. Indices in ``common`` are one-hot. The paper states neither the
-        ranges of bias and blue mass nor what becomes of a wrong stack. Ours are chosen so that without the green cube
-        little can be told: the ratio of blue and red is as likely one way as the other, and the bias spreads readings over
+        Decisions are whole motions instead of 20 ms steps. Indices in ``common`` are one-hot, and the reading is a logarithm
+        with a place for each cube, green first: bias and red are told by the difference from green's. The paper states
+        neither the ranges of bias and blue mass nor what becomes of a wrong stack. Ours are chosen so that without the green
+        cube little can be told: the ratio of blue and red is as likely one way as the other, and the bias spreads readings over
         a factor of 4; comparing the two raw readings and knowing the bias' range is right in 58 % of the episodes.
         In ``physics="full"``, a grasp is a fixed constraint between hand and cube, and the mass is read from its force.
 
@@ -191,7 +201,10 @@ class BlindMassStack(Task):
         self.config = config = config or BlindMassStackConfig()
         self.time_limit = config.n_decisions * DECISION_PERIOD
         self.action_space = spaces.MultiDiscrete([N_PLACES, len(HEIGHTS), 2])
-        self.common_space = spaces.Box(-1.0, 1.0, (_N_COMMON,), np.float32)
+        # Positions of cubes and hand, green cube, grasp, held cube; readings.
+        self._low = np.array([-1.0] * 12 + [0.0] * 10, dtype=np.float32)
+        self._high = np.array([1.0] * 19 + [_shown(READINGS[1])] * N_PLACES, dtype=np.float32)
+        self.common_space = spaces.Box(self._low, self._high, dtype=np.float32)
         bounds = np.array((INDEX_SCALE, BIAS_SCALE), dtype=np.float32)
         self.privileged_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         self.scene = self._scene()
@@ -200,6 +213,7 @@ class BlindMassStack(Task):
         self.masses: tuple[float, ...] = ()
         self.bias = 1.0
         self._green_one_hot: tuple[float, ...] = ()
+        self._scale_order: tuple[int, ...] = ()
         self._potentials = (0.0, 0.0, 0.0)
         # From one end of the row to the other; no way between two places is longer by more than the jitter.
         self._row_length = 2.0 * (config.spacing + config.jitter)
@@ -232,6 +246,7 @@ class BlindMassStack(Task):
         self.bias = c.greatest_bias ** rng.uniform(-1.0, 1.0)
         jitter = rng.uniform(-c.jitter, c.jitter, (N_PLACES, 2)).tolist()
         self._green_one_hot = tuple(float(i == self.green) for i in range(N_PLACES))
+        self._scale_order = (self.green, *sorted((self.red, self.blue)))
         placements = {
             name: ((c.place_x + dx, (i - 1) * c.spacing + dy, 0.5 * EDGE), 0.0)
             for i, (name, (dx, dy)) in enumerate(zip(order, jitter, strict=True))
@@ -301,7 +316,7 @@ class BlindMassStack(Task):
 
     def common(self, state: RobotState) -> np.ndarray:
         """
-        Cubes, hand, green cube, grasp and reading (see the task card), float32 ``(20,)``.
+        Cubes, hand, green cube, grasp and reading (see the task card), float32 ``(22,)``.
 
         :param state: of the arm
         """
@@ -312,11 +327,11 @@ class BlindMassStack(Task):
             values += ((x - middle) / POSITION_SCALE, y / POSITION_SCALE, z / POSITION_SCALE)
         held = state.held
         values += self._green_one_hot
-        values += (held != NOTHING, held == 0, held == 1, held == 2, self.bias * state.load / MASS_SCALE)
-        if max(values) > 1.0 or min(values) < -1.0:
-            # A cube was knocked off its place.
-            values = [max(-1.0, min(1.0, value)) for value in values]
-        return np.array(values, dtype=np.float32)
+        values += (held != NOTHING, held == 0, held == 1, held == 2)
+        reading = _shown(self.bias * state.load) if state.load > 0.0 else 0.0
+        values += (reading if held == i else 0.0 for i in self._scale_order)
+        # A cube may be knocked off its place.
+        return np.clip(np.array(values, dtype=np.float32), self._low, self._high)
 
     def privileged(self) -> np.ndarray:
         """Index of the red cube and bias (see the task card), float32 ``(2,)``."""
@@ -338,6 +353,11 @@ class BlindMassStack(Task):
         c = self.config
         spacing = c.spacing / INDEX_SCALE
         return np.array((c.place_x, float(mean[0]) * spacing)), np.array((0.0, float(std[0]) * spacing))
+
+
+def _shown(reading: float) -> float:
+    """The scale's reading as it is observed."""
+    return math.log(reading / READINGS[0]) / READING_STEP
 
 
 def _stands_on(upper: Vector3, lower: Vector3) -> bool:

@@ -26,7 +26,8 @@ def reading(observation: dict[str, np.ndarray]) -> float:
 
     :param observation: ``common`` is read, nothing else
     """
-    return float(observation["common"][19]) * 2.5
+    shown = float(observation["common"][19:22].max())
+    return 0.25 * math.exp(0.5 * shown) if shown > 0.0 else 0.0
 
 
 def others(observation: dict[str, np.ndarray]) -> list[int]:

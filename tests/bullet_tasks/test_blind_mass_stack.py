@@ -144,8 +144,9 @@ def test_colours_and_masses_are_drawn_alike(env):
 
 def test_the_scale_shows_the_biased_mass_of_what_hangs_free(env):
     for seed in range(20):
-        red, green, _ = start(env, seed)
+        red, green, blue = start(env, seed)
         task = env.unwrapped.task
+        place = 1 if red < blue else 2
         standing, *_ = act(env, (red, LOW, CLOSE))
         lifted, *_ = act(env, (red, MIDDLE, CLOSE))
         carried, *_ = act(env, (green, HIGH, CLOSE))
@@ -153,6 +154,9 @@ def test_the_scale_shows_the_biased_mass_of_what_hangs_free(env):
         for observation, expected in ((standing, 0.0), (lifted, 0.75), (carried, 0.75), (on_green, 0.0)):
             assert reading(observation) == pytest.approx(task.bias * expected, abs=1e-6)
             assert observation["common"][15:19].tolist() == [1.0, *(float(i == red) for i in range(3))]
+            assert (observation["common"][19:] > 0.0).tolist() == [i == place and expected > 0.0 for i in range(3)]
+        on_red, *_ = act(env, (red, LOW, OPEN), (green, LOW, CLOSE), (red, HIGH, CLOSE))
+        assert reading(on_red) == pytest.approx(task.bias, abs=1e-6) and on_red["common"][19] > 0.0
 
 
 def test_observed_positions_are_the_cubes_and_the_hands(env):
@@ -413,6 +417,7 @@ def test_a_belief_is_drawn_at_the_red_cubes_place(env):
         ({"blue_ratio": (1.4, 1.3)}, "blue_ratio"),
         ({"greatest_bias": 1.0}, "greatest_bias"),
         ({"greatest_bias": 3.0}, "beyond the 2.5 kg"),
+        ({"red_mass": 0.6}, "above the 0.25 kg"),
         ({"jitter": 0.05}, "needs 0.13 m"),
         ({"jitter": -0.01}, "jitter"),
         ({"spacing": 0.29}, "reach"),
