@@ -104,6 +104,7 @@ class USPLPPO(PPO):
     :param replay_bytes: memory budget of the episode replay
     :param encoder_learning_rate: of the encoder; constant, as in the release, unless a schedule is given (Tables 4 and 5: 5e-5
         and 2e-5 for the large encoder)
+    :param encoder_learning_rate_floor: share of it that is left at the end of training, after half a cosine wave
     :param encoder_weight_decay: of the encoder (Tables 4 and 5)
     :param encoder_batch_size: decisions per encoder update, in whole episodes (Tables 4 and 5: 8000, 16000)
     :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170)
@@ -182,6 +183,7 @@ class USPLPPO(PPO):
         replay: str = "mismatched",
         replay_bytes: int = 256_000_000,
         encoder_learning_rate: float | Schedule = 1e-3,
+        encoder_learning_rate_floor: float = 1.0,
         encoder_weight_decay: float = 0.0,
         encoder_batch_size: int = 4096,
         encoder_updates: int = 16,
@@ -245,7 +247,7 @@ class USPLPPO(PPO):
         self.mismatch_hold_time = mismatch_hold_time
         self.wander_share, self.wander_share_matched, self.wander_time = wander_share, wander_share_matched, wander_time
         self.replay, self.replay_bytes = replay, replay_bytes
-        self.encoder_learning_rate = encoder_learning_rate
+        self.encoder_learning_rate, self.encoder_learning_rate_floor = encoder_learning_rate, encoder_learning_rate_floor
         self.encoder_weight_decay = encoder_weight_decay
         self.encoder_batch_size, self.encoder_updates = encoder_batch_size, encoder_updates
         self.encoder_max_grad_norm, self.encoder_warmup = encoder_max_grad_norm, encoder_warmup
@@ -264,7 +266,8 @@ class USPLPPO(PPO):
         self._check_arguments()
         self.n_mismatched = count_mismatched(self.mismatch_fraction, self.n_envs)
         period = self.decision_period = ask_decision_period(self.env, self.decision_period)
-        self.encoder_lr_schedule = FloatSchedule(self.encoder_learning_rate)
+        rate, floor = self.encoder_learning_rate, self.encoder_learning_rate_floor
+        self.encoder_lr_schedule = FloatSchedule(CosineSchedule(rate, floor) if isinstance(rate, int | float) else rate)
         smoothing = smoothing_factor(self.smoothing_time, self.decision_period)
         given = self.policy_kwargs, self.rollout_buffer_kwargs
         self.policy_kwargs = {

@@ -181,8 +181,8 @@ class BlindMassStack(Task):
         Decisions are whole motions instead of 20 ms steps. Indices in ``common`` are one-hot, and the reading is a logarithm
         with a place for each cube, green first: bias and red are told by the difference from green's. The paper states
         neither the ranges of bias and blue mass nor what becomes of a wrong stack. Ours are chosen so that without the green
-        cube little can be told: the ratio of blue and red is as likely one way as the other, and the bias spreads readings over
-        a factor of 4; comparing the two raw readings and knowing the bias' range is right in 58 % of the episodes.
+        cube little can be told: the ratio of blue and red is as likely one way as the other, and the bias spreads readings
+        over a factor of 4; comparing the two raw readings and knowing the bias' range is right in 58 % of the episodes.
         In ``physics="full"``, a grasp is a fixed constraint between hand and cube, and the mass is read from its force.
 
     Source
