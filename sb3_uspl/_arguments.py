@@ -71,7 +71,6 @@ def check_arguments(model: "USPLPPO") -> None:
         "encoder_batch_size": (model.encoder_batch_size, 1, np.inf),
         "context_length": (model.context_length, 1, np.inf),
         "encoder_beta": (model.encoder_beta, 0, 1),
-        "wander_share_matched": (model.wander_share_matched, 0, 1),
         "wander_share": (model.wander_share, 0, 1),
         "mismatch_fraction": (model.mismatch_fraction or 0.0, 0, 0.9),
         "decision_period": (1.0 if model.decision_period is None else model.decision_period, 1e-6, np.inf),

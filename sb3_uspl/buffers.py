@@ -19,7 +19,6 @@ from sb3_uspl.observations import (
     PRIVILEGED,
     TARGET,
     TRUTH,
-    WANDERING,
     policy_observation_space,
 )
 
@@ -244,8 +243,6 @@ class USPLRolloutBuffer(DictRolloutBuffer):
     PPO's rollout buffer for what actor and critic saw, which also feeds the encoder's :class:`EpisodeReplayBuffer`.
 
     The last ``n_mismatched`` environments acted on wrong privileged observations: they feed the encoder, never PPO's loss.
-    Nor do decisions that an environment wandered through instead of taking the policy's action: what came before is valued by
-    the critic where the wandering began, what comes after starts where it led.
 
     :param buffer_size: decisions per environment and rollout
     :param observation_space: the environment's observation space (the contract)
@@ -269,7 +266,6 @@ class USPLRolloutBuffer(DictRolloutBuffer):
 
     def reset(self) -> None:
         self.n_envs = self.n_collecting
-        self.wandering = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         super().reset()
 
     def add(self, obs: dict[str, np.ndarray], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
@@ -278,25 +274,9 @@ class USPLRolloutBuffer(DictRolloutBuffer):
         :param args: as for ``DictRolloutBuffer.add``
         :param kwargs: as for ``DictRolloutBuffer.add``
         """
-        self.wandering[self.pos] = obs.get(WANDERING, False)
         super().add(obs, *args, **kwargs)
         if self.episodes is not None:
             self.episodes.add(obs)
-
-    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
-        if not self.wandering.any():
-            super().compute_returns_and_advantage(last_values, dones)
-            return
-        # SB3's, but for the advantage of a wandering decision, which is nobody's merit.
-        next_values, next_starts = last_values.cpu().numpy().flatten(), dones.astype(np.float32)
-        advantage = np.zeros(self.n_envs, dtype=np.float32)
-        for step in reversed(range(self.buffer_size)):
-            discount = self.gamma * (1.0 - next_starts)
-            delta = self.rewards[step] + discount * next_values - self.values[step]
-            advantage = np.where(self.wandering[step], 0.0, delta + discount * self.gae_lambda * advantage)
-            self.advantages[step] = advantage
-            next_values, next_starts = self.values[step], self.episode_starts[step]
-        self.returns = self.advantages + self.values
 
     def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
         if not self.generator_ready and self.n_mismatched > 0:
@@ -304,12 +284,4 @@ class USPLRolloutBuffer(DictRolloutBuffer):
             self.observations = {key: array[:, : self.n_envs] for key, array in self.observations.items()}
             for name in ("actions", "values", "log_probs", "advantages", "returns"):
                 setattr(self, name, getattr(self, name)[:, : self.n_envs])
-        if not self.wandering.any():
-            yield from super().get(batch_size)
-            return
-        next(super().get(1))  # brings the arrays into the order of samples
-        own = np.flatnonzero(~self.wandering[:, : self.n_envs].T.flatten())
-        indices = np.random.permutation(own)
-        batch_size = batch_size or len(indices)
-        for start in range(0, len(indices), batch_size):
-            yield self._get_samples(indices[start : start + batch_size])
+        yield from super().get(batch_size)

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 COMMON, TARGET, PRIVILEGED = "common", "target", "privileged"
 TRUTH, UNCERTAINTY, BELIEF = "truth", "uncertainty", "belief"
-PREVIOUS_ACTION, EPISODE_STEP, WANDERING = "previous_action", "episode_step", "wandering"
+PREVIOUS_ACTION, EPISODE_STEP = "previous_action", "episode_step"
 
 POLICY_KEYS = (COMMON, PRIVILEGED, TRUTH, UNCERTAINTY, BELIEF)
 """What PPO's networks and rollout buffer hold; the encoder's inputs (``target``, previous actions) never reach them."""

@@ -97,8 +97,6 @@ class USPLPPO(PPO):
         privileged observation, spread over the environments. None: once a rollout (release).
     :param wander_share: share of time in which a mismatched environment repeats a random action of its own, so that the
         encoder sees what the policy does not look at yet (0 in the release)
-    :param wander_share_matched: the same for the other environments. PPO leaves such decisions out and goes on from where they
-        lead, so that it learns what being informed is worth before it has found the way there.
     :param wander_time: least and greatest length of such a stretch in s
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
     :param replay_bytes: memory budget of the episode replay
@@ -178,7 +176,6 @@ class USPLPPO(PPO):
         mismatch_fraction: float | None = None,
         mismatch_hold_time: tuple[float, float] | None = None,
         wander_share: float = 0.0,
-        wander_share_matched: float = 0.0,
         wander_time: tuple[float, float] = (0.5, 5.0),
         replay: str = "mismatched",
         replay_bytes: int = 256_000_000,
@@ -245,7 +242,7 @@ class USPLPPO(PPO):
         self.smoothing_time, self.decision_period = smoothing_time, decision_period
         self.mismatch_fraction = mismatch_fraction
         self.mismatch_hold_time = mismatch_hold_time
-        self.wander_share, self.wander_share_matched, self.wander_time = wander_share, wander_share_matched, wander_time
+        self.wander_share, self.wander_time = wander_share, wander_time
         self.replay, self.replay_bytes = replay, replay_bytes
         self.encoder_learning_rate, self.encoder_learning_rate_floor = encoder_learning_rate, encoder_learning_rate_floor
         self.encoder_weight_decay = encoder_weight_decay
@@ -315,7 +312,6 @@ class USPLPPO(PPO):
             n_mismatched=self.n_mismatched,
             mismatch_hold=hold and in_decisions("mismatch_hold_time", hold, period),
             wander_share=self.wander_share,
-            wander_share_matched=self.wander_share_matched,
             wander_hold=in_decisions("wander_time", self.wander_time, period),
         )
         self._rollout_env = None

@@ -23,7 +23,6 @@ from sb3_uspl.observations import (
     TARGET,
     TRUTH,
     UNCERTAINTY,
-    WANDERING,
     check_finite,
     check_normalization,
 )
@@ -56,7 +55,6 @@ class UncertaintyConfig:
     n_mismatched: int = 0
     mismatch_hold: tuple[float, float] | None = None
     wander_share: float = 0.0
-    wander_share_matched: float = 0.0
     wander_hold: tuple[float, float] = (1.0, 1.0)
 
 
@@ -153,7 +151,6 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations; with
     ``mismatch_hold``, each draws another one after a random time, whose mean is spread log-uniformly over that range, so that
     the encoder sees the behaviour of the undecided and of those who change their mind before the policy has learned either.
-    Where environments wander, ``wandering`` tells which of them will not take the next action.
 
     :param venv: environments under the observation contract
     :param encoder: observation encoder
@@ -177,8 +174,10 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self._matched = np.arange(self.num_envs) < self.num_envs - config.n_mismatched
         if config.mismatch_hold is not None:
             self._redraw_rate = 1.0 / np.geomspace(*config.mismatch_hold, config.n_mismatched)
-        share = np.where(self._matched, config.wander_share_matched, config.wander_share)
-        self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng) if share.any() else None
+        self._wandering = None
+        if config.wander_share > 0.0:
+            share = np.where(self._matched, 0.0, config.wander_share)
+            self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng)
 
     def reset(self) -> VecEnvObs:
         return self.begin(self.venv.reset())  # type: ignore[arg-type]
@@ -266,7 +265,6 @@ class UncertaintyVecWrapper(VecEnvWrapper):
             out[TARGET] = obs[TARGET]
         if self._wandering is not None:
             self._wandering.advance()
-            out[WANDERING] = self._wandering.active.copy()
         matched = self._matched
         self.metrics["uncertainty"].append(float(self.std[matched].mean()))
         self.metrics["prediction_error"].append(float(np.abs(mean - obs[PRIVILEGED])[matched].mean()))

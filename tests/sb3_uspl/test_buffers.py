@@ -150,31 +150,3 @@ def test_behaviour_that_gives_the_truth_away_is_not_learned_from(telltale):
     chosen = [not episode.mismatched for _ in range(20) for episode in episodes._choose(40)]
     assert any(matched) and not all(matched)
     assert any(chosen) != telltale
-
-
-def test_wandering_is_nobodys_merit_and_never_learned_from():
-    rng = np.random.default_rng(0)
-    n_steps, values, rewards = 7, rng.normal(size=(7, N_ENVS)), rng.normal(size=(7, N_ENVS))
-    wandering = np.zeros((n_steps, N_ENVS), dtype=bool)
-    wandering[3:5, 1] = True
-
-    def fill_buffer(wanders):
-        space = spaces.Box(-1.0, 1.0, (1,))
-        buffer = USPLRolloutBuffer(n_steps, ToyEnv().observation_space, space, n_envs=N_ENVS, gamma=0.9, gae_lambda=0.8)
-        for t in range(n_steps):
-            obs = observation([t] * N_ENVS, float(t)) | ({"wandering": wandering[t]} if wanders else {})
-            actions = np.arange(N_ENVS, dtype=np.float32)[:, None] + 10.0 * t
-            starts = np.full(N_ENVS, t == 0, dtype=np.float32)
-            buffer.add(obs, actions, rewards[t], starts, th.as_tensor(values[t]), th.zeros(N_ENVS))
-        buffer.compute_returns_and_advantage(th.zeros(N_ENVS), np.zeros(N_ENVS, dtype=bool))
-        return buffer
-
-    stock, buffer = fill_buffer(False), fill_buffer(True)
-    others = [0, 2, 3]
-    np.testing.assert_allclose(buffer.advantages[:, others], stock.advantages[:, others], rtol=1e-5)
-    np.testing.assert_allclose(buffer.advantages[5:, 1], stock.advantages[5:, 1], rtol=1e-5)
-    # The last decision before the wandering is worth what the critic expects where that began.
-    assert buffer.advantages[2, 1] == pytest.approx(rewards[2, 1] + 0.9 * values[3, 1] - values[2, 1], rel=1e-4)
-    learned = np.concatenate([batch.actions.numpy()[:, 0] for batch in buffer.get(4)])
-    expected = [env + 10.0 * t for t in range(n_steps) for env in range(N_ENVS) if not wandering[t, env]]
-    assert sorted(learned) == sorted(expected)
