@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS
 from sb3_uspl.chosen_uncertainty import read_uncertainty
@@ -73,26 +73,42 @@ def write(arguments: argparse.Namespace) -> None:
     uncertainty = read_uncertainty(arguments.uncertainty) if arguments.uncertainty is not None else None
     model, venv = load_agent(arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs=1)
     venv.close()
-    if unwrap_vec_normalize(venv) is not None:
-        raise ValueError("The agent was trained under VecNormalize; films and replays run in the plain environment.")
-    kwargs = {"physics": arguments.physics} if arguments.physics else {}
     if arguments.film is None:
-        _write_replay(model, arguments, kwargs)
+        write_replay_page(model, venv, arguments)
         return
+    _check_plain(venv)
     from sb3_uspl.film import film
 
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
-    with contextlib.closing(make_for_pictures(arguments.env, kwargs)) as env:
+    with contextlib.closing(make_for_pictures(arguments.env, _env_kwargs(arguments))) as env:
         film({arguments.algo: model}, env, seeds, arguments.film, uncertainty, arguments.policy)
     print(arguments.film)
 
 
-def _write_replay(model: BaseAlgorithm, arguments: argparse.Namespace, kwargs: dict[str, Any]) -> None:
+def write_replay_page(model: BaseAlgorithm, venv: VecEnv, arguments: argparse.Namespace) -> None:
+    """
+    Write the episode ``arguments.seed`` of the deployment policy as the page ``arguments.replay``.
+
+    :param model: the agent
+    :param venv: its environments, only asked for what they are wrapped in
+    :param arguments: with ``env``, ``algo``, ``physics``, ``seed`` and ``replay``
+    :raises ValueError: if it cannot be shown
+    """
     from sb3_uspl.replay import write_replay
 
-    with contextlib.closing(gym.make(arguments.env, **kwargs)) as env:
+    _check_plain(venv)
+    with contextlib.closing(gym.make(arguments.env, **_env_kwargs(arguments))) as env:
         title = f"{arguments.env}: {arguments.algo}, deployment policy, seed {arguments.seed}"
         write_replay(model, env, arguments.seed, arguments.replay, title)
+
+
+def _check_plain(venv: VecEnv) -> None:
+    if unwrap_vec_normalize(venv) is not None:
+        raise ValueError("The agent was trained under VecNormalize; films and replays run in the plain environment.")
+
+
+def _env_kwargs(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"physics": arguments.physics} if arguments.physics else {}
 
 
 def make_for_pictures(env_id: str, kwargs: dict[str, Any]) -> gym.Env:

@@ -3,6 +3,7 @@
 import difflib
 import functools
 import importlib
+import importlib.util
 import itertools
 import os
 import sys
@@ -28,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import bullet_tasks as bullet_tasks  # registers the environments
 from bullet_tasks.vec_env import BulletVecEnv
 from sb3_uspl import RMA, USPLPPO, PrivRecons, RESeLPPO, RewReg
+from sb3_uspl._agents import LOADING_ERRORS, why_not_loaded
 from sb3_uspl._configs import CONFIGS, load_entries
 from sb3_uspl._optimize import register_samplers
 
@@ -113,6 +115,13 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         learn = functools.partial(model.learn, reset_num_timesteps=False)
         super().learn(SimpleNamespace(learn=learn, env=model.env, policy=model.policy))  # type: ignore[arg-type]
 
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        try:
+            return super()._load_pretrained_agent(hyperparams, env)
+        except LOADING_ERRORS as error:
+            env.close()
+            raise SystemExit(why_not_loaded(self.algo, self.trained_agent, error)) from error
+
     def create_callbacks(self) -> None:
         super().create_callbacks()
         self.callbacks.append(ProgressCSV(os.path.join(self.save_path, "progress.csv")))
@@ -158,7 +167,10 @@ def _value_of(*names: str) -> str | None:
 
 
 def check_command_line() -> None:
-    """End with a message, rather than with the zoo's traceback, if the environment on the command line is unknown."""
+    """
+    End with a message, rather than with the zoo's traceback, if the environment on the command line is unknown, the model that
+    is to be trained on is missing, or the tracker is not installed.
+    """
     packages = itertools.takewhile(lambda name: not name.startswith("-"), _after("--gym-packages"))
     for package in packages:
         importlib.import_module(package)
@@ -168,6 +180,17 @@ def check_command_line() -> None:
             check_names("ppo", env_id)
         except ValueError as error:
             raise SystemExit(str(error)) from error
+    model = _value_of("-i", "--trained-agent")
+    if model and not (model.endswith(".zip") and os.path.isfile(model)):
+        raise SystemExit(f"-i {model}: there is no such model; expected the .zip file that a training or model.save() wrote.")
+    if "--track" in sys.argv and not _is_installed("wandb"):
+        raise SystemExit('--track needs Weights & Biases, which the extra brings: pip install -e ".[track]", or wandb itself.')
+
+
+def _is_installed(package: str) -> bool:
+    spec = importlib.util.find_spec(package)
+    # A folder that merely has the package's name, such as the one in which W&B stores its runs, has no file of its own.
+    return spec is not None and spec.origin is not None
 
 
 def _after(name: str) -> list[str]:

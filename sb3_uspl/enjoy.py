@@ -3,6 +3,7 @@
 from gymnasium.error import DependencyNotInstalled
 
 from sb3_uspl import _episode
+from sb3_uspl._agents import check_agent
 from sb3_uspl._zoo import check_command_line, register, use_default_folder
 
 
@@ -26,4 +27,5 @@ if __name__ == "__main__":
     check_command_line()
     if not _episode.run("enjoy"):
         use_default_folder()
+        check_agent()
         watch()

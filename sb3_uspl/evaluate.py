@@ -5,16 +5,17 @@ import contextlib
 import json
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
-import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-import sb3_uspl
-from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, BulletVecEnv, check_names, register, rl_zoo3
+from sb3_uspl import _episode
+from sb3_uspl._agents import find_model, load_model
+from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, BulletVecEnv, check_names, register
 from sb3_uspl.evaluation import EVALUATION_SEED, evaluate
 
 
@@ -46,9 +47,9 @@ def load_agent(
     from rl_zoo3.utils import create_test_env, get_saved_hyperparams
 
     check_names(algo, env_id)
-    model_path = _find_model(algo, env_id, folder, exp_id, best) if path is None else path
+    model_path = find_model(algo, env_id, folder, exp_id, best) if path is None else path
     log_path = os.path.dirname(model_path)
-    model = _load_model(algo, model_path)
+    model = load_model(algo, model_path)
     hyperparams, stats_path = get_saved_hyperparams(os.path.join(log_path, env_id), test_mode=True)
     venv = create_test_env(
         env_id,
@@ -71,29 +72,6 @@ def load_agent(
     return model, venv
 
 
-def _find_model(algo: str, env_id: str, folder: str, exp_id: int, best: bool) -> str:
-    from rl_zoo3.utils import get_model_path
-
-    try:
-        return get_model_path(exp_id, folder, algo, rl_zoo3.utils.EnvironmentName(env_id), load_best=best)[1]
-    except (AssertionError, ValueError) as error:
-        raise ValueError(f"{error}. Agents are looked for in <folder>/<algo>/<env>_<id>/.") from error
-
-
-def _load_model(algo: str, path: str) -> BaseAlgorithm:
-    if not os.path.isfile(path):
-        raise ValueError(f"There is no model {path}; expected the .zip file that model.save() writes.")
-    try:
-        return rl_zoo3.ALGOS[algo].load(path, device="cpu")
-    # What is raised depends on where two versions differ.
-    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError, ImportError) as error:
-        raise ValueError(
-            f"{path} cannot be loaded as a model of {algo} ({type(error).__name__}: {error}). Was it saved by another "
-            f"algorithm, or by other versions than sb3_uspl {sb3_uspl.__version__} and Stable-Baselines3 "
-            f"{stable_baselines3.__version__}? Name its algorithm, install its versions, or train anew."
-        ) from error
-
-
 def parse_arguments() -> argparse.Namespace:
     """:return: command line"""
     parser = argparse.ArgumentParser(prog="python -m sb3_uspl.evaluate", description=__doc__)
@@ -112,6 +90,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
     parser.add_argument("--n-envs", type=int, default=32, help="environments that run at the same time")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.add_argument(
+        _episode.REPLAY, type=Path, help=".html file to write: the first of the episodes in 3-D, with a timeline"
+    )
     return parser.parse_args()
 
 
@@ -139,10 +120,13 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         )
     except ValueError as error:
         raise SystemExit(str(error)) from error
-    try:
+    with contextlib.closing(venv):
+        if arguments.replay is not None:
+            try:
+                _episode.write_replay_page(model, venv, arguments)
+            except ValueError as error:
+                raise SystemExit(str(error)) from error
         result = evaluate(model, venv, arguments.episodes, arguments.seed, arguments.policy)
-    finally:
-        venv.close()
     return {"algo": arguments.algo, "env": arguments.env, "physics": arguments.physics, **result}
 
 

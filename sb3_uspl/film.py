@@ -1,5 +1,6 @@
 """Films of the deployment policy: what the robot does beside what it believes. Needs matplotlib (extra ``zoo``)."""
 
+import importlib.util
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
@@ -15,13 +17,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Ellipse, Patch, Polygon, Rectangle
 from PIL import Image
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
 
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Shape
 from sb3_uspl._arguments import PAPER_DECISION_PERIOD
 from sb3_uspl.chosen_uncertainty import ChosenUncertainty
-from sb3_uspl.observations import PRIVILEGED, TARGET
+from sb3_uspl.observations import PRIVILEGED, TARGET, is_image
 from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR, BeliefInWorld, on_map
 from sb3_uspl.policies import DeploymentState, USPLPolicy
 
@@ -30,6 +31,7 @@ FRAMES_PER_SECOND = 8.0
 FIRST_FRAME_TIME, LAST_FRAME_TIME = 1.0, 2.5
 """s for which the beginning and the end of an episode stand still."""
 GIF_COLOURS = 200
+_MP4_PACKAGES = ("imageio", "imageio_ffmpeg")
 _WIDTH, _DPI = 10.0, 90
 _ROW_HEIGHT = {True: 4.6, False: 3.9}  # inches an agent, by whether the panels lie one above the other
 _WIDE = 2.0  # ratio of width to height from which the picture lies above the map instead of beside it
@@ -106,7 +108,8 @@ def record_clip(
     period = decision_period_of(env)
     obs, info = env.reset(seed=seed)
     clip = _new_clip(env, seed, obs[PRIVILEGED], policy)
-    has_camera = TARGET in obs and is_image_space(env.observation_space[TARGET])  # type: ignore[index]
+    camera = env.observation_space.spaces.get(TARGET)  # type: ignore[attr-defined]
+    has_camera = camera is not None and is_image(camera)
     state: DeploymentState | None = None
     over = False
     while True:
@@ -127,12 +130,20 @@ def record_clip(
         if env.render_mode == "rgb_array":
             clip.pictures.append(env.render())  # type: ignore[arg-type]
         if has_camera:
-            clip.views.append(obs[TARGET][0].copy())
+            clip.views.append(_as_grey(obs[TARGET], camera))
         if over:
             clip.success = bool(info.get("is_success", False))
             return clip
         obs, _, terminated, truncated, info = env.step(action)
         over = terminated or truncated
+
+
+def _as_grey(image: np.ndarray, space: spaces.Box) -> np.ndarray:
+    """First channel, from black to white within the bounds of the space."""
+    if image.dtype == np.uint8:
+        return image[0].copy()
+    low, high = space.low[0].astype(float), space.high[0].astype(float)
+    return np.rint(255.0 * np.clip((image[0] - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
 
 
 def map_of(env: gym.Env) -> BeliefInWorld:
@@ -196,10 +207,13 @@ def film(
     :param uncertainty: shown to the policies in place of their encoders'
     :param policy: "deployment" or "privileged", see :func:`record_clip`
     :return: the episodes: for each seed those of all agents
-    :raises ValueError: for another file type, without an agent or seed, or if an agent has no belief
+    :raises ValueError: for another file type, a missing package, without an agent or seed, or if an agent has no belief
     """
     if out.suffix not in (".gif", ".mp4"):
         raise ValueError(f"{out}: a film is a .gif or a .mp4 file.")
+    missing = [name for name in _MP4_PACKAGES if importlib.util.find_spec(name) is None]
+    if out.suffix == ".mp4" and missing:
+        raise ValueError(f'A .mp4 film needs {missing}, which the extra brings: pip install -e ".[zoo]". A .gif does without.')
     if not agents or not seeds:
         raise ValueError("A film needs at least one agent and one seed.")
     period = decision_period_of(env)

@@ -4,6 +4,7 @@ import runpy
 import warnings
 
 from sb3_uspl import _episode
+from sb3_uspl._agents import check_agent
 from sb3_uspl._zoo import check_command_line, register, use_default_folder
 
 if __name__ == "__main__":
@@ -13,5 +14,6 @@ if __name__ == "__main__":
         use_default_folder()
         # The zoo loads the model with its one environment, as if to train it.
         warnings.filterwarnings("ignore", message=".*too few to give some a mismatched privileged observation")
+        check_agent()
         # The zoo's recorder is a script without a function to call.
         runpy.run_module("rl_zoo3.record_video", run_name="__main__", alter_sys=True)

@@ -13,12 +13,10 @@ import cv2
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
 
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Shape
 from sb3_uspl.film import Clip, record_clip
-from sb3_uspl.observations import TARGET
 from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR
 
 _CORNERS = 32
@@ -56,10 +54,10 @@ def write_replay(model: BaseAlgorithm, env: gym.Env, seed: int, out: Path, title
         raise ValueError(
             f"{world} has no belief_in_world(mean, std), which says where on its map a belief lies, so there is none to show."
         )
-    notes = _Notes(env)
-    clip = record_clip(model, notes, seed)
+    noted = _Heights(env)
+    clip = record_clip(model, noted, seed)
     title = title or f"{type(model).__name__}, seed {seed}"
-    data = page_data(clip, notes.heights, notes.views, float(env.get_wrapper_attr("decision_period")))
+    data = page_data(clip, noted.heights, float(env.get_wrapper_attr("decision_period")))
     template = string.Template(importlib.resources.files("sb3_uspl").joinpath("replay_page.html").read_text("utf-8"))
     # "</script>" in a text would end the script.
     text = json.dumps(data).replace("<", "\\u003c")
@@ -68,40 +66,34 @@ def write_replay(model: BaseAlgorithm, env: gym.Env, seed: int, out: Path, title
     return clip
 
 
-class _Notes(gym.Wrapper):
-    """What a clip does not hold: the robot's height, and the images of its camera if it has one."""
+class _Heights(gym.Wrapper):
+    """What a clip does not hold: the robot's height."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
-        space: Any = env.observation_space
-        self.has_camera = TARGET in space.spaces and is_image_space(space[TARGET])
         self.heights: list[float] = []
-        self.views: list[np.ndarray] = []
 
     def reset(self, **kwargs: Any) -> Any:
-        obs, info = self.env.reset(**kwargs)
-        self._note(obs)
-        return obs, info
+        result = self.env.reset(**kwargs)
+        self._note()
+        return result
 
     def step(self, action: Any) -> Any:
-        obs, *others = self.env.step(action)
-        self._note(obs)
-        return obs, *others
+        result = self.env.step(action)
+        self._note()
+        return result
 
-    def _note(self, obs: Any) -> None:
+    def _note(self) -> None:
         world: Any = self.env.unwrapped
         self.heights.append(float(world.robot.state.z) if hasattr(world, "robot") else 0.0)
-        if self.has_camera:
-            self.views.append(obs[TARGET][0].copy())
 
 
-def page_data(clip: Clip, heights: Sequence[float], views: Sequence[np.ndarray], period: float) -> dict[str, Any]:
+def page_data(clip: Clip, heights: Sequence[float], period: float) -> dict[str, Any]:
     """
     Everything that the page draws.
 
     :param clip: the episode
     :param heights: of the robot at every decision and once after the last one, m
-    :param views: of its camera at the same times, uint8 ``(height, width)``; or none
     :param period: s per decision
     :return: what the page's script reads, ready for JSON
     """
@@ -117,7 +109,10 @@ def page_data(clip: Clip, heights: Sequence[float], views: Sequence[np.ndarray],
     floor = clip.scene.ground_height(*clip.poses[0][:2]) if clip.scene is not None else 0.0
     floor = (floor if math.isfinite(floor) else 0.0) + lift
     belief = _mesh_trace(
-        np.column_stack([circle, np.full(len(circle), floor)]), _fan(_CORNERS), SIGMA_COLOUR, "belief, ±1 &sigma;"
+        np.column_stack([circle, np.full(len(circle), floor)]),
+        _fan(_CORNERS),
+        SIGMA_COLOUR,
+        "belief, ±1 \N{GREEK SMALL LETTER SIGMA}",
     )
     traces = [
         _mesh_trace(points, triangles, None, "scene", facecolor=colours, showlegend=False, flatshading=True),
@@ -134,7 +129,7 @@ def page_data(clip: Clip, heights: Sequence[float], views: Sequence[np.ndarray],
         "sigmas": list(map(float, clip.sigmas)),
         "errors": list(map(float, clip.errors)),
         "outcome": f"{'reached the goal' if clip.success else 'failed'} after {period * (len(path) - 1):.1f} s",
-        "camera": [_as_png(view) for view in views],
+        "camera": [_as_png(view) for view in clip.views],
         "robot": robot.tolist(),
         "circle": circle.tolist(),
         "traces": {"path": 1, "belief": 2, "robot": 3},
@@ -243,7 +238,7 @@ def _curves(clip: Clip, period: float) -> dict[str, Any]:
     unit = "" if clip.scene is None else " (m)"
     time = [period * i for i in range(len(clip.sigmas))]
     lines = (
-        ("uncertainty &sigma;", clip.sigmas, SIGMA_COLOUR, "solid"),
+        ("uncertainty \N{GREEK SMALL LETTER SIGMA}", clip.sigmas, SIGMA_COLOUR, "solid"),
         ("|belief - truth|", clip.errors, _ERROR_COLOUR, "dash"),
     )
     data = [

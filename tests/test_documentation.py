@@ -22,6 +22,18 @@ TINY = {
     "train": "-n 128 --eval-freq 64 --eval-episodes 1 -params n_envs:4 n_steps:16 batch_size:32".split(),
     "evaluate": "--episodes 2 --n-envs 2".split(),
 }
+DRIVER = """
+import runpy, shlex, sys
+for line in sys.argv[1:]:
+    print(line)
+    _, _, module, *arguments = shlex.split(line)
+    sys.argv = [module, *arguments]
+    try:
+        runpy.run_module(module, run_name="__main__")
+    except SystemExit as end:
+        if end.code:
+            raise
+"""
 PREAMBLE = "import gymnasium, gymnasium as gym, bullet_tasks, my_module\n"
 MY_MODULE = """
 import gymnasium as gym
@@ -119,33 +131,57 @@ def _venv():
 
 
 def run_in(folder, *arguments):
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join((str(folder), str(ROOT)))}
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", "PYTHONPATH": os.pathsep.join((str(folder), str(ROOT)))}
     return subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True, timeout=600)
+
+
+def prepare(page, folder, entry_point):
+    """What a page's commands and examples take for granted: a module of the reader's own, and files that the page shows."""
+    (folder / "my_module.py").write_text(MY_MODULE + f'\n\ngym.register(id="MyTask-v0", entry_point={entry_point})\n')
+    for block in blocks(page, "text"):
+        if block.startswith("seconds,sigma"):
+            (folder / "schedule.csv").write_text(block)
+
+
+def small(command):
+    """The command with a tiny budget, in words; None if it is one of make's."""
+    words = shlex.split(command)
+    if words[0] == "make":
+        return None
+    tiny = TINY.get(words[2].rpartition(".")[2], [])
+    return [*words, *(["-n", "60"] if "--no-render" in words else tiny)]
+
+
+def test_the_commands_of_the_readme_run_in_its_order(tmp_path):
+    """In one process, which is quicker; the slow test below runs each in its own."""
+    page = ROOT / "README.md"
+    prepare(page, tmp_path, "make")
+    lines = [shlex.join(words) for words in map(small, commands(page)) if words]
+    assert len(lines) >= 5
+    result = run_in(tmp_path, "-c", DRIVER, *lines)
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-3000:]
+    assert {"film.mp4", "replay.html", "policy.onnx", "policy.json"} <= {path.name for path in tmp_path.iterdir()}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name)
 def test_commands_run(page, tmp_path):
-    (tmp_path / "my_module.py").write_text(MY_MODULE + '\n\ngym.register(id="MyTask-v0", entry_point=make)\n')
-    for block in blocks(page, "text"):
-        if block.startswith("seconds,sigma"):
-            (tmp_path / "schedule.csv").write_text(block)
-    for command in commands(page):
-        words = shlex.split(command)
-        if words[0] == "make":
-            continue
-        tiny = TINY.get(words[2].rpartition(".")[2], [])
-        if "--no-render" in words:
-            tiny = ["-n", "60"]
-        result = run_in(tmp_path, *words[1:], *tiny)
-        assert result.returncode == 0, command + "\n" + result.stdout[-2000:] + result.stderr[-2000:]
+    prepare(page, tmp_path, "make")
+    for words in filter(None, map(small, commands(page))):
+        result = run_in(tmp_path, *words[1:])
+        assert result.returncode == 0, shlex.join(words) + "\n" + result.stdout[-2000:] + result.stderr[-2000:]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
+def with_python():
+    """The README's examples in every run of the tests, the others' in those of the slow ones."""
+    pages = [page for page in PAGES if blocks(page, "python")]
+    return [page if page.name == "README.md" else pytest.param(page, marks=pytest.mark.slow) for page in pages]
+
+
+@pytest.mark.parametrize("page", with_python(), ids=name)
 def test_examples_run(page, tmp_path):
     """All of a page's, one after the other, with less of everything."""
-    (tmp_path / "my_module.py").write_text(MY_MODULE + '\n\ngym.register(id="MyTask-v0", entry_point=Plain)\n')
+    prepare(page, tmp_path, "Plain")
     program = PREAMBLE + "\n".join(blocks(page, "python"))
     program = re.sub(r"learn\([\d_]+\)", "learn(64)", re.sub(r"n_envs=\d+", "n_envs=6", program))
     program = re.sub(r"n_steps=\d+", "n_steps=16", program)

@@ -1,59 +1,22 @@
-"""The commands of the README, small: train with the zoo, evaluate, errors that help."""
+"""The commands of the README, small: train with the zoo, evaluate, watch, plot."""
 
-import contextlib
 import csv
 import inspect
-import io
 import json
-import os
-import runpy
+import pickle
+import shutil
 import subprocess
 import sys
-from types import SimpleNamespace
-from unittest import mock
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from torch import nn
 
 from sb3_uspl import RESeLPolicy, USPLPolicy
 from sb3_uspl._configs import CONFIGS, load_entries
 from sb3_uspl._zoo import ALGORITHMS, is_ours
-
-
-def run(module, *arguments):
-    """The command in this process: importing torch and the zoo anew takes longer than what most of these tests do."""
-    stdout, stderr = io.StringIO(), io.StringIO()
-    code: object = 0
-    with (
-        mock.patch.object(sys, "argv", [module, *arguments]),
-        contextlib.redirect_stdout(stdout),
-        contextlib.redirect_stderr(stderr),
-    ):
-        try:
-            runpy.run_module(module, run_name="__main__")
-        except SystemExit as end:
-            code = end.code
-    # What the interpreter would do with it.
-    message, code = (code, 1) if isinstance(code, str) else ("", code or 0)
-    return SimpleNamespace(returncode=code, stdout=stdout.getvalue(), stderr=stderr.getvalue() + message)
-
-
-def run_apart(*arguments):
-    env = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, "-m", *arguments], capture_output=True, text=True, env=env, timeout=300)
-
-
-SMALL = ("n_envs:8", "n_steps:32", "batch_size:64", "learning_rate_floor:0.1")
-ENV = "TargetReaching-v0"
-
-
-def train(folder, algo="uspl_ppo", n=1024, *arguments, small=SMALL, run=run):
-    command = ("sb3_uspl.train", "--algo", algo, "--env", ENV, "-f", str(folder), "-n", str(n), "--seed", "1")
-    encoder = () if algo == "resel_ppo" else ("encoder_updates:1",)
-    result = run(*command, *arguments, "-params", *small, *encoder)
-    assert result.returncode == 0, result.stdout + result.stderr
-    return result.stdout
+from tests.sb3_uspl.commands import ENV, run, run_apart, train
 
 
 @pytest.fixture(scope="module")
@@ -99,11 +62,6 @@ def test_evaluation_prints_one_json_object(logs):
     assert {"success_rate", "privileged_success_rate", "mean_length", "prediction_error_final"} <= set(measured)
 
 
-def test_a_missing_agent_is_explained(tmp_path):
-    result = run("sb3_uspl.evaluate", "--env", "TargetReaching-v0", "-f", str(tmp_path))
-    assert result.returncode != 0 and "<folder>/<algo>/<env>_<id>/" in result.stderr and "Traceback" not in result.stderr
-
-
 @pytest.mark.parametrize("algo", sorted(set(ALGORITHMS) - {"uspl_ppo"}))
 def test_every_algorithm_trains_and_is_evaluated(algo, tmp_path):
     train(tmp_path, algo, 512)
@@ -142,6 +100,16 @@ def test_enjoy_writes_a_replay_and_runs_without_a_window(logs, tmp_path):
     assert result.returncode == 0 and "Success rate" in result.stdout, result.stderr
 
 
+def test_evaluation_shows_its_first_episode(logs, tmp_path):
+    pytest.importorskip("plotly")
+    where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(logs), "--episodes", "1", "--json")
+    result = run("sb3_uspl.evaluate", *where, "--policy", "deployment", "--replay", str(tmp_path / "a.html"))
+    assert result.returncode == 0, result.stderr
+    measured, page = json.loads(result.stdout), (tmp_path / "a.html").read_text("utf-8")
+    outcome = "reached the goal" if measured["success_rate"] else "failed"
+    assert f"seed {measured['seed']}" in page and f'"{outcome} after {0.2 * measured["mean_length"]:.1f} s"' in page
+
+
 def test_record_video_writes_a_film(logs, tmp_path):
     pytest.importorskip("moviepy")
     where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(logs), "-o", str(tmp_path))
@@ -163,23 +131,36 @@ def test_films_of_what_the_robot_believes_under_a_chosen_uncertainty(logs, tmp_p
     assert result.returncode != 0 and "for films" in result.stderr
 
 
-def test_a_missing_window_is_explained(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    result = run("sb3_uspl.enjoy", "--algo", "uspl_ppo", "--env", "LateralChoice-v0")
-    assert result.returncode != 0 and "needs a display" in result.stderr and "--film FILE.mp4" in result.stderr
-
-
-def test_training_success_can_be_plotted(logs, monkeypatch):
-    """The zoo only shows its plot; what it drew is read from the figure."""
-    plot_train = pytest.importorskip("rl_zoo3.plots.plot_train")
-    plt = plot_train.plt
-    monkeypatch.setattr(plt, "show", lambda: None)
-    arguments = ["-a", "uspl_ppo", "-e", ENV, "-f", str(logs), "-y", "success", "-w", "2"]
-    monkeypatch.setattr(sys, "argv", ["plot_train", *arguments])
-    plot_train.plot_train()
+def test_training_success_is_drawn_without_a_window(logs, tmp_path):
+    plt = pytest.importorskip("rl_zoo3.plots.plot_train").plt
+    arguments = ("-a", "uspl_ppo", "-e", ENV, "-f", str(logs), "-y", "success", "-w", "2")
+    result = run("sb3_uspl.plots", "plot_train", *arguments, "-o", str(tmp_path / "a.png"))
+    assert result.returncode == 0 and (tmp_path / "a.png").stat().st_size > 5000, result.stderr
     (line,) = plt.gca().lines
     assert len(line.get_ydata()) > 5 and 0.0 <= min(line.get_ydata()) and max(line.get_ydata()) <= 1.0
     plt.close("all")
+
+
+def test_evaluations_of_one_training_are_gathered_and_drawn(logs, tmp_path):
+    """One only, over which the zoo's own stumbles."""
+    plt = pytest.importorskip("rl_zoo3.plots.plot_train").plt
+    successes = np.load(logs / "uspl_ppo" / f"{ENV}_1" / "evaluations.npz")["successes"]
+    arguments = ("-a", "uspl_ppo", "-e", ENV, "-f", str(logs), "-k", "successes", "--no-display", "-o", str(tmp_path / "a"))
+    result = run("sb3_uspl.plots", "all_plots", *arguments)
+    assert result.returncode == 0 and f": {successes[-1].mean():.1%} ± 0.0% (1 training)" in result.stdout, result.stderr
+    (entry,) = pickle.loads((tmp_path / "a.pkl").read_bytes())[ENV].values()
+    np.testing.assert_allclose(entry["mean"], successes.mean(axis=1))
+    drawn = ("-i", str(tmp_path / "a"), "-l", "USPL", "-o", str(tmp_path / "b.png"), "--format", "png")
+    result = run("sb3_uspl.plots", "plot_from_file", *drawn)
+    assert result.returncode == 0 and (tmp_path / "b.png").stat().st_size > 5000, result.stderr
+    plt.close("all")
+
+
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="no virtual display here: apt-get install xvfb")
+def test_a_window_opens_where_there_is_a_display():
+    command = ("-m", "sb3_uspl.enjoy", "--algo", "uspl_ppo", "--env", "LateralChoice-v0", "-n", "5")
+    result = subprocess.run(["xvfb-run", "-a", sys.executable, *command], capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0 and "GL_RENDERER" in result.stdout, result.stdout[-1000:] + result.stderr[-1000:]
 
 
 def test_export_of_a_trained_agent(logs, tmp_path):
@@ -188,28 +169,6 @@ def test_export_of_a_trained_agent(logs, tmp_path):
     assert result.returncode == 0, result.stderr
     card = json.loads((tmp_path / "out.json").read_text())
     assert (tmp_path / "out.pt").is_file() and card["environment"] == ENV and card["decision_period_s"] == 0.2
-
-
-@pytest.mark.parametrize("command", ["train", "enjoy", "evaluate", "export", "record_video"])
-def test_an_unknown_environment_is_explained(command, tmp_path):
-    out = ("-o", str(tmp_path)) if command in ("export", "record_video") else ()
-    result = run(f"sb3_uspl.{command}", "--algo", "uspl_ppo", "--env", "LateralChoise-v0", "-f", str(tmp_path), *out)
-    assert result.returncode != 0 and "Traceback" not in result.stderr
-    assert "LateralChoice-v0?" in result.stderr and ENV in result.stderr
-
-
-def test_an_unknown_algorithm_is_explained(tmp_path):
-    result = run("sb3_uspl.evaluate", "--algo", "usppl", "--env", ENV, "-f", str(tmp_path))
-    assert result.returncode != 0 and "Traceback" not in result.stderr and "'uspl_ppo'" in result.stderr
-
-
-def test_agents_of_other_spaces_and_of_other_algorithms_are_refused(logs, tmp_path):
-    model = str(logs / "uspl_ppo" / f"{ENV}_1" / f"{ENV}.zip")
-    out = ("-o", str(tmp_path / "out"), "--path", model)
-    result = run("sb3_uspl.export", "--env", "LateralChoice-v0", *out)
-    assert result.returncode != 0 and "trained on other spaces" in result.stderr and "Traceback" not in result.stderr
-    result = run("sb3_uspl.export", "--algo", "resel_ppo", "--env", ENV, *out)
-    assert result.returncode != 0 and "Name its algorithm" in result.stderr and "Traceback" not in result.stderr
 
 
 def test_importing_the_package_does_not_import_the_zoo_or_pybullet():

@@ -1,5 +1,9 @@
 """Pictures and films are written, and show each episode from its first decision to its end."""
 
+import base64
+import contextlib
+
+import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,8 +16,9 @@ import bullet_tasks  # noqa: F401
 from sb3_uspl import USPLPPO
 from sb3_uspl.envs import TargetReachingEnv
 from sb3_uspl.evaluation import EpisodeRecord
-from sb3_uspl.film import FIRST_FRAME_TIME, FRAMES_PER_SECOND, LAST_FRAME_TIME, film, record_clip
+from sb3_uspl.film import FIRST_FRAME_TIME, FRAMES_PER_SECOND, LAST_FRAME_TIME, _as_grey, film, record_clip
 from sb3_uspl.pictures import _quantile_over_time, _read_progress, learning_curve, on_map, sigma_over_time
+from sb3_uspl.replay import page_data
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -127,6 +132,39 @@ def test_film_of_an_environment_without_scene_or_picture(tmp_path):
     clips = film({"USPL": tiny(env)}, env, [0], tmp_path / "film.gif")
     assert clips[0].pictures == [] and len(gif_frames(tmp_path / "film.gif")[0]) == len(clips[0].poses) == 6
     np.testing.assert_allclose(clips[0].goal, env.unwrapped.target, atol=1e-6)
+
+
+class Seen(gym.ObservationWrapper):
+    """Notes the images that the robot gets."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.images = []
+
+    def observation(self, obs):
+        self.images.append(obs["target"][0].copy())
+        return obs
+
+
+@pytest.mark.parametrize("env_id", ["SignpostNavDepth-v0", "MidpointChoiceDepth-v0", "StairwaySearchDepth-v0"])
+def test_a_depth_camera_is_seen_in_the_film_and_in_the_replay(env_id, tmp_path):
+    with contextlib.closing(Seen(gym.wrappers.TimeLimit(gym.make(env_id, render_mode="rgb_array"), 3))) as env:
+        (clip,) = film({"USPL": tiny(env)}, env, [0], tmp_path / "film.gif")
+    assert len(clip.views) == len(clip.pictures) == len(clip.poses) == 4
+    np.testing.assert_array_equal(clip.views, env.images)
+    assert clip.views[0].min() < clip.views[0].max(), "or there is nothing to see"
+    assert len(gif_frames(tmp_path / "film.gif")[0]) == 4
+    pictures = page_data(clip, [0.3] * 4, 0.25)["camera"]
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[-1].split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    scale = shown.shape[0] // clip.views[-1].shape[0]
+    assert scale > 1
+    np.testing.assert_array_equal(shown[::scale, ::scale], clip.views[-1])
+
+
+def test_a_view_in_half_precision_is_black_to_white_between_its_bounds():
+    space = gym.spaces.Box(-1.0, 3.0, (1, 2, 2), np.float16)
+    image = np.array([[[-1.0, 1.0], [2.0, 3.0]]], np.float16)
+    np.testing.assert_array_equal(_as_grey(image, space), [[0, 128], [191, 255]])
 
 
 def test_mp4_repeats_still_frames(tmp_path):

@@ -4,10 +4,12 @@ import json
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from PIL import Image, ImageChops
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
@@ -24,10 +26,19 @@ from sb3_uspl.replay import page_data, scene_mesh, write_replay
 from tests.sb3_uspl.toy import ToyEnv
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+# Software rendering, no network, and virtual time: 8 s of the page's, however long they take here.
+BROWSER_OPTIONS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--window-size=1100,700"),
+    *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    "--virtual-time-budget=8000",
+)
+VIEW_HEIGHT = 540  # pixels
+ARTEFACTS = Path(__file__).resolve().parents[2] / "build" / "test_artefacts"
 
 STUBS = """
 const elements = {}, calls = [];
 const element = id => elements[id] ??= { on() {}, textContent: "", value: "0" };
+globalThis.location = { hash: "" };
 globalThis.document = { getElementById: element };
 element("data").textContent = require("fs").readFileSync(0, "utf8");
 element("speed").value = "1000";
@@ -107,8 +118,8 @@ def test_an_environment_without_a_scene_and_one_with_a_camera(tmp_path):
     env = gym.wrappers.TimeLimit(TargetReachingEnv(), 5)
     clip = write_replay(tiny(env), env, 0, tmp_path / "a.html")
     assert data_of(tmp_path / "a.html")["camera"] == [] and len(clip.poses) == 6
-    views = [np.full((10, 16), 40 * i, np.uint8) for i in range(6)]
-    data = page_data(clip, [0.0] * 6, views, 0.2)
+    clip.views = [np.full((10, 16), 40 * i, np.uint8) for i in range(6)]
+    data = page_data(clip, [0.0] * 6, 0.2)
     assert len(set(data["camera"])) == 6 and all(view.startswith("data:image/png;base64,") for view in data["camera"])
 
 
@@ -148,11 +159,30 @@ def test_script_plays_to_the_end_and_the_timeline_leads_back(page):
     assert json.loads(result.stdout) == [data_of(out)["outcome"], len(clip.poses) - 1, 3, "running"]
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium here: apt-get install chromium")
-def test_page_draws_itself_in_a_browser(page, tmp_path):
-    arguments = ("--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--window-size=1100,700")
-    where = (f"--user-data-dir={tmp_path}", "--virtual-time-budget=8000", "--dump-dom", page[0].as_uri())
-    result = subprocess.run([BROWSER, *arguments, *where], capture_output=True, text=True, timeout=120)
-    assert result.stdout.count("gl-container") >= 1, "no 3-D scene"
-    assert re.search(r'<output id="time">0\.00 s', result.stdout) and '<span id="outcome">running' in result.stdout
+def browse(address, folder):
+    """Open a page, wait until it has drawn itself, and take a picture; return what it holds by then."""
+    where = (f"--user-data-dir={folder}", f"--screenshot={folder / 'page.png'}", "--dump-dom", address)
+    result = subprocess.run([BROWSER, *BROWSER_OPTIONS, *where], capture_output=True, text=True, timeout=300)
     assert "Refused to" not in result.stderr
+    with Image.open(folder / "page.png") as image:
+        return result.stdout, image.convert("RGB").crop((0, 0, image.width, VIEW_HEIGHT))
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium here: apt-get install chromium")
+def test_page_draws_itself_in_a_browser_at_its_start_and_at_a_moment(page, tmp_path):
+    """The second picture is kept in build/."""
+    out, clip = page
+    # A picture is higher than the view that the page is laid out for.
+    lower = tmp_path / "page.html"
+    lower.write_text(out.read_text("utf-8").replace("height: 100vh", f"height: {VIEW_HEIGHT}px"), "utf-8")
+    last = len(clip.poses) - 1
+    begin, first = browse(lower.as_uri(), tmp_path)
+    end, second = browse(f"{lower.as_uri()}#{0.25 * last}", tmp_path)
+    assert begin.count("gl-container") >= 1, "no 3-D scene"
+    assert re.search(r'<output id="time">0\.00 s', begin) and '<span id="outcome">running' in begin
+    assert f'<output id="time">{0.25 * last:.2f} s' in end and f'<span id="outcome">{data_of(out)["outcome"]}' in end
+    assert len(first.getcolors(first.width * first.height)) > 100, "nothing was drawn"
+    moved = ImageChops.difference(first, second).crop((0, 100, 600, VIEW_HEIGHT - 100))
+    assert moved.getbbox() is not None, "the robot is where it was"
+    ARTEFACTS.mkdir(parents=True, exist_ok=True)
+    second.save(ARTEFACTS / "replay.png")

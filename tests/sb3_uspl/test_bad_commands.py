@@ -1,0 +1,146 @@
+"""What is wrong with a command is said in a sentence, with what to do; never by a traceback."""
+
+import shutil
+import sys
+
+import pytest
+
+from sb3_uspl import USPLPPO
+from sb3_uspl._agents import load_model
+from sb3_uspl._zoo import TRAINED_AGENTS, _is_installed
+from tests.sb3_uspl.commands import ENV, SMALL, run, run_apart
+
+COMMANDS = ("train", "enjoy", "evaluate", "export", "record_video")
+READERS = COMMANDS[1:]
+SHIPPED = TRAINED_AGENTS / "uspl_ppo" / f"{ENV}_1" / f"{ENV}.zip"
+
+
+def refused(module, *arguments, run=run):
+    result = run(module, *arguments)
+    assert result.returncode != 0 and "Traceback" not in result.stderr, result.stdout + result.stderr
+    return result.stderr
+
+
+def out(command, folder):
+    return ("-o", str(folder / "out")) if command in ("export", "record_video") else ()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_unknown_environment_is_told_what_there_is(command, tmp_path):
+    where = ("--algo", "uspl_ppo", "--env", "LateralChoise-v0", "-f", str(tmp_path), *out(command, tmp_path))
+    message = refused(f"sb3_uspl.{command}", *where)
+    assert "LateralChoice-v0?" in message and ENV in message
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_unknown_algorithm_is_told_what_there_is(command, tmp_path):
+    where = ("--algo", "usppl", "--env", ENV, "-f", str(tmp_path), *out(command, tmp_path))
+    message = refused(f"sb3_uspl.{command}", *where)
+    assert "usppl" in message and "uspl_ppo" in message and "resel_ppo" in message
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_a_missing_agent_is_told_where_agents_lie(command, tmp_path):
+    where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(tmp_path), *out(command, tmp_path))
+    assert "<folder>/<algo>/<env>_<id>/" in refused(f"sb3_uspl.{command}", *where)
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_an_agent_of_another_version_or_algorithm_is_refused(command, tmp_path):
+    folder = tmp_path / "resel_ppo" / f"{ENV}_1"
+    shutil.copytree(SHIPPED.parent, folder)
+    where = ("--algo", "resel_ppo", "--env", ENV, "-f", str(tmp_path), *out(command, tmp_path))
+    message = refused(f"sb3_uspl.{command}", *where)
+    assert str(folder / SHIPPED.name) in message and "by other versions than sb3_uspl" in message
+
+
+@pytest.mark.parametrize("change", ["argument", "shape", "no model"])
+def test_a_model_of_another_version_is_refused(change, tmp_path):
+    path = tmp_path / "model.zip"
+    if change == "no model":
+        path.write_text("not a model")
+    else:
+        model = USPLPPO.load(SHIPPED, device="cpu")
+        # An argument that a later version took out; a network that it gave other layers.
+        changes = {"argument": {"no_longer_there": 1}, "shape": {"net_arch": [7]}}
+        model.policy_kwargs = {**model.policy_kwargs, **changes[change]}
+        model.save(path)
+    with pytest.raises(ValueError, match=r"by other versions than sb3_uspl .* or train anew"):
+        load_model("uspl_ppo", str(path))
+
+
+def test_an_agent_of_other_spaces_is_refused(tmp_path):
+    message = refused("sb3_uspl.export", "--env", "LateralChoice-v0", "--path", str(SHIPPED), "-o", str(tmp_path / "out"))
+    assert "trained on other spaces" in message and not list(tmp_path.iterdir())
+    message = refused(
+        *("sb3_uspl.train", "--algo", "uspl_ppo", "--env", "ActiveTMaze-v0", "-f", str(tmp_path), "-i", str(SHIPPED)),
+        *("-n", "64", "-params", *SMALL),
+    )
+    assert "trained on other spaces" in message and "spaces do not match" in message
+
+
+def test_a_missing_model_to_go_on_with_is_named(tmp_path):
+    arguments = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(tmp_path), "-i", str(tmp_path / "gone.zip"))
+    assert "gone.zip: there is no such model" in refused("sb3_uspl.train", *arguments)
+
+
+def test_a_missing_window_is_told_what_goes_without(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    message = refused("sb3_uspl.enjoy", "--algo", "uspl_ppo", "--env", "LateralChoice-v0")
+    assert "needs a display" in message and "--film FILE.mp4" in message
+
+
+@pytest.mark.parametrize("module", ["train", "plots"])
+def test_a_missing_zoo_is_told_how_to_install_it(module, tmp_path):
+    """Apart, since a module that is there once cannot be missing here."""
+    (tmp_path / "rl_zoo3.py").write_text("raise ImportError('no zoo')")
+    message = refused(f"sb3_uspl.{module}", run=lambda name: run_apart(name, PYTHONPATH=str(tmp_path)))
+    assert 'pip install -e ".[zoo]"' in message and "no zoo" in message
+
+
+def test_a_missing_tracker_is_told_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    message = refused("sb3_uspl.train", "--algo", "uspl_ppo", "--env", ENV, "--track", "-f", str(tmp_path))
+    assert 'pip install -e ".[track]"' in message
+
+
+def test_a_folder_of_runs_is_no_package(tmp_path, monkeypatch):
+    (tmp_path / "folder_of_runs").mkdir()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert _is_installed("yaml") and not _is_installed("folder_of_runs") and not _is_installed("no_such_package")
+
+
+def test_a_film_as_mp4_without_its_packages_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_uspl.film._MP4_PACKAGES", ("imageio", "no_such_writer"))
+    arguments = ("--env", ENV, "--film", str(tmp_path / "a.mp4"))
+    message = refused("sb3_uspl.record_video", *arguments)
+    assert "no_such_writer" in message and 'pip install -e ".[zoo]"' in message and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "plot_train|all_plots|plot_from_file"),
+        (("plot_train", "-a", "uspl_ppo", "-e", ENV, "-f", "gone", "-y", "success", "-o", "a.png"), "no folder gone"),
+        (("all_plots", "-a", "uspl_ppo", "-e", ENV, "-f", "gone", "--no-display"), "--eval-freq"),
+        (("plot_from_file", "-i", "gone"), "no file gone.pkl"),
+    ],
+)
+def test_plots_of_nothing_are_refused(arguments, message):
+    assert message in refused("sb3_uspl.plots", *arguments)
+
+
+def test_tracking_is_the_zoos(tmp_path, monkeypatch):
+    (tmp_path / "wandb.py").write_text(
+        "import types\ngiven = {}\n"
+        "def init(**kwargs):\n    given.update(kwargs)\n    return types.SimpleNamespace(config={})\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    tracked = ("--track", "--wandb-project-name", "looking", "-f", str(tmp_path / "logs"), "-n", "256", "--eval-freq", "-1")
+    result = run("sb3_uspl.train", "--algo", "uspl_ppo", "--env", ENV, *tracked, "-params", *SMALL, "encoder_updates:1")
+    assert result.returncode == 0, result.stderr
+    given = sys.modules.pop("wandb").given
+    assert given["project"] == "looking" and given["sync_tensorboard"] and given["config"]["algo"] == "uspl_ppo"
+    assert list((tmp_path / "runs").glob("**/events.out.tfevents*")), "what W&B would read"
