@@ -130,11 +130,18 @@ def test_plots_of_nothing_are_refused(arguments, message):
     assert message in refused("sb3_uspl.plots", *arguments)
 
 
+WANDB = """
+import types
+given = {}
+def init(**kwargs):
+    given.update(kwargs)
+    return types.SimpleNamespace(config=types.SimpleNamespace(setdefaults=lambda values: given.update(later=dict(values))))
+"""
+
+
 def test_tracking_is_the_zoos(tmp_path, monkeypatch):
-    (tmp_path / "wandb.py").write_text(
-        "import types\ngiven = {}\n"
-        "def init(**kwargs):\n    given.update(kwargs)\n    return types.SimpleNamespace(config={})\n"
-    )
+    """Up to what W&B is told, since it is not installed here."""
+    (tmp_path / "wandb.py").write_text(WANDB)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "wandb", raising=False)
@@ -143,4 +150,5 @@ def test_tracking_is_the_zoos(tmp_path, monkeypatch):
     assert result.returncode == 0, result.stderr
     given = sys.modules.pop("wandb").given
     assert given["project"] == "looking" and given["sync_tensorboard"] and given["config"]["algo"] == "uspl_ppo"
+    assert given["later"]["saved_hyperparams"]["n_envs"] == 8
     assert list((tmp_path / "runs").glob("**/events.out.tfevents*")), "what W&B would read"
