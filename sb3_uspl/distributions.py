@@ -1,51 +1,9 @@
-"""Exploration: bounded means that do not get stuck at their bounds, and Gaussian noise that is correlated in time."""
+"""Exploration: Gaussian noise that is correlated in time."""
 
 import math
-from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
-
-
-class RecoverableTanh(th.autograd.Function):
-    """
-    tanh whose gradient towards zero is that of the identity; away from zero it is tanh's own.
-
-    With a fixed standard deviation, nothing keeps PPO from driving the mean of a steering action deep into saturation, where
-    tanh passes on a ten-thousandth of the gradient: a habit of the warm-up, with the privileged observation at hand, could not
-    be unlearned when that is blurred. (Midpoint Choice: after 2 M decisions, 30 % of all decisions had inputs beyond 1.6,
-    after 8 M 44 %, and a privileged policy that had been perfect lost one of the four corners for good.)
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:  # type: ignore[override]
-        """
-        :param ctx: autograd's
-        :param x: any shape
-        :return: tanh(x)
-        """
-        y = th.tanh(x)
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:  # type: ignore[override]
-        """
-        :param ctx: autograd's
-        :param gradient: of the result; descent goes against it, so towards zero where the two have the same sign
-        """
-        (y,) = ctx.saved_tensors
-        return th.where(gradient * y > 0.0, gradient, gradient * (1.0 - y**2))
-
-
-def recoverable_tanh(x: th.Tensor) -> th.Tensor:
-    """
-    See :class:`RecoverableTanh`.
-
-    :param x: any shape
-    :return: tanh(x)
-    """
-    return RecoverableTanh.apply(x)  # type: ignore[no-untyped-call, no-any-return]
 
 
 class CorrelatedGaussianDistribution(DiagGaussianDistribution):

@@ -15,7 +15,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 from torch import nn
 
-from sb3_uspl.distributions import CorrelatedGaussianDistribution, recoverable_tanh
+from sb3_uspl.activations import recoverable_tanh
+from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, encode_actions, reset_rows
 from sb3_uspl.observations import (
     BELIEF,

@@ -13,8 +13,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtr
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_uspl.activations import recoverable_tanh
 from sb3_uspl.baselines.sequences import EMBEDDING, HistoryEncoder, SequenceBatch
-from sb3_uspl.distributions import recoverable_tanh
 from sb3_uspl.encoder import RunningNormalizer, Tokens, encode_actions, reset_rows
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_observation_space
 from sb3_uspl.policies import PolicyFeatures, USPLPolicy

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
+from sb3_uspl.activations import RecoverableTanh
 from sb3_uspl.encoder.features import TokenFeatures, Tokens, mlp
 from sb3_uspl.encoder.memory import MEMORIES, MemoryState
 from sb3_uspl.observations import PRIVILEGED, TARGET, is_image
@@ -214,7 +215,7 @@ class ObservationEncoder(nn.Module):
         self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
         self.embedding = mlp(self.memory.width, sizes["embedding"])
         if sizes["embedding"]:
-            self.embedding[-1] = nn.Tanh()  # "the final embedding is activated using the Tanh function" (C.3.3)
+            self.embedding[-1] = RecoverableTanh()  # "the final embedding is activated using the Tanh function" (C.3.3)
         width = sizes["embedding"][-1] if sizes["embedding"] else self.memory.width
         self.mean = self._head(width, sizes["head"], n_privileged)
         self.log_std = self._head(width, sizes["head"], n_privileged)

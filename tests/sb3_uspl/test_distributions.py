@@ -5,7 +5,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_uspl import USPLPPO
-from sb3_uspl.distributions import CorrelatedGaussianDistribution, recoverable_tanh
+from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from tests.sb3_uspl.toy import ToyEnv
 
 
@@ -30,25 +30,3 @@ def test_the_time_constant_does_not_depend_on_the_decision_period():
         return model.policy.action_dist.correlation
 
     assert correlation(0.1) ** 5 == pytest.approx(correlation(0.5)) and 0.0 < correlation(0.5) < 1.0
-
-
-def test_recoverable_tanh_is_tanh_but_for_the_way_back_to_zero():
-    x = th.tensor([-3.0, -0.5, 0.5, 3.0], requires_grad=True)
-    y, slope = recoverable_tanh(x), 1.0 - th.tanh(x.detach()) ** 2
-    assert th.equal(y, th.tanh(x))
-    inwards = th.autograd.grad(y, x, th.sign(x), retain_graph=True)[0]
-    outwards = th.autograd.grad(y, x, -th.sign(x))[0]
-    assert th.equal(inwards, th.sign(x.detach()))
-    assert th.allclose(outwards, -th.sign(x.detach()) * slope)
-
-
-@pytest.mark.parametrize(("squash", "recovers"), [(recoverable_tanh, True), (th.tanh, False)])
-def test_a_saturated_mean_can_be_unlearned(squash, recovers):
-    x = th.tensor([6.0, -6.0], requires_grad=True)
-    optimizer = th.optim.SGD([x], lr=0.1)
-    for _ in range(200):
-        loss = squash(x).square().sum()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert bool((th.tanh(x).abs() < 0.1).all()) is recovers
