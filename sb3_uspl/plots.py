@@ -61,6 +61,8 @@ def all_plots() -> None:
             rl_zoo3.plots.all_plots()
         except KeyError as error:
             raise ValueError(f"{error} of -k: 'successes' needs environments that say info['is_success'].") from error
+        except np.exceptions.AxisError as error:
+            raise ValueError("The only training was evaluated on one episode at a time: --eval-episodes 2 or more.") from error
         path = Path(f"{out}.pkl")
         results = with_one_axis(pickle.loads(path.read_bytes()))
         path.write_bytes(pickle.dumps(results))

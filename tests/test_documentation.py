@@ -19,8 +19,9 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("**/*.md"))]
 ALGORITHMS = {"uspl_ppo": USPLPPO, "rma": RMA, "rewreg": RewReg, "privrecons": PrivRecons, "resel_ppo": RESeLPPO}
 TINY = {
-    "train": "-n 128 --eval-freq 64 --eval-episodes 1 -params n_envs:4 n_steps:16 batch_size:32".split(),
+    "train": "-n 512 --eval-freq 256 --eval-episodes 2 -params n_envs:4 n_steps:64 batch_size:128".split(),
     "evaluate": "--episodes 2 --n-envs 2".split(),
+    "plot_train": "-w 1".split(),
 }
 DRIVER = """
 import runpy, shlex, sys
@@ -148,8 +149,8 @@ def small(command):
     words = shlex.split(command)
     if words[0] == "make":
         return None
-    tiny = TINY.get(words[2].rpartition(".")[2], [])
-    return [*words, *(["-n", "60"] if "--no-render" in words else tiny)]
+    kind = "plot_train" if "plot_train" in words else words[2].rpartition(".")[2]
+    return [*words, *(["-n", "60"] if "--no-render" in words else TINY.get(kind, []))]
 
 
 def test_the_commands_of_the_readme_run_in_its_order(tmp_path):
