@@ -168,6 +168,7 @@ def browse(address, folder):
         return result.stdout, image.convert("RGB").crop((0, 0, image.width, VIEW_HEIGHT))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium here: apt-get install chromium")
 def test_page_draws_itself_in_a_browser(page, tmp_path):
     """The picture is kept in build/."""
