@@ -13,6 +13,7 @@ from bullet_tasks.ends import Judge, Outcome
 from bullet_tasks.robots import a1_model, gait
 from bullet_tasks.robots.base import Robot, RobotState, Stretch
 from bullet_tasks.robots.gait import FOOT_RADIUS, Gait, Trot
+from bullet_tasks.robots.gait_walls import FOOTPRINT, give_way
 from bullet_tasks.robots.quadruped_body import CONTACT_FORCE, MAX_YAW_RATE, SUBSTEP, YAW_GAIN, QuadrupedCommand
 from bullet_tasks.simulation import quaternion
 from bullet_tasks.world import World
@@ -33,7 +34,6 @@ _BODY_FRICTION = 0.2  # the trunk slides along walls
 _PLACED_ABOVE = 0.002  # m
 _AWAY = 1000.0  # m
 _OTHER_BODY, _LINK, _NORMAL_FORCE = 2, 3, 9  # fields of a record of getContactPoints
-_AHEAD_TIME = 0.1  # s
 _HALF_TURN = math.pi + 1e-6  # rad; beyond it a heading is nearer the other way round
 
 
@@ -66,7 +66,7 @@ class WalkingPreset:
             raise ValueError(f"`motor_gain` must be greater than 0 and at most 1, got {self.motor_gain}.")
 
 
-FAST = WalkingPreset(physics_rate=120, iterations=20, motor_gain=0.35, meshes=False)
+FAST = WalkingPreset(physics_rate=120, iterations=20, motor_gain=0.5, meshes=False)
 """The light model at 120 Hz."""
 ACCURATE = WalkingPreset(physics_rate=240, iterations=50, motor_gain=0.2, meshes=True)
 """The A1 of ``pybullet_data`` at 240 Hz; its legs have all their shapes, which may hook on walls."""
@@ -99,8 +99,9 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         self._world = world
         self._dt = 1.0 / preset.physics_rate
         self._steps = round(SUBSTEP * preset.physics_rate)
-        self._speed = self._target_yaw = self._reference = self._ahead = self._pitch = 0.0
-        self._forgotten = math.exp(-self._dt / _AHEAD_TIME)
+        self._speed = self._target_yaw = self._reference = self._pitch = 0.0
+        self._height = FOOT_RADIUS + preset.gait.height
+        self._limits = (preset.gait.wall_time, preset.gait.sidestep, preset.gait.turn_room)
         self._measured = np.zeros(gait.N_MEASUREMENTS)
         simulation = world.simulation
         simulation.configure(self._dt, _GRAVITY)
@@ -152,8 +153,8 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         :param phase: of the stride that the robot will begin with, 0 to 1
         """
         self.trot.reset(ground, phase)
-        self._speed, self._target_yaw, self._reference, self._ahead, self._pitch = 0.0, yaw, yaw, 0.0, 0.0
-        z = ground + FOOT_RADIUS + self.preset.gait.height
+        self._speed, self._target_yaw, self._reference, self._pitch = 0.0, yaw, yaw, 0.0
+        z = ground + self._height
         angles = self.trot.angles.ravel().tolist()
         # Where nothing is in touch first, so that PyBullet forgets the contacts of the episode before.
         for height in (_AWAY, z + _PLACED_ABOVE):
@@ -183,7 +184,8 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         if abs(turn) > _HALF_TURN:
             turn = math.remainder(turn, math.tau)
         self._target_yaw = self.state.yaw + turn
-        self._ahead = self._reference - self.state.yaw
+        # What the heading still lacks of the last turn is forgotten: whoever commands has seen it.
+        self._reference = self.state.yaw
 
     def advance(self, n_substeps: int, judge: Judge) -> Stretch:
         """
@@ -207,7 +209,18 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         yaw = self.state.yaw
         for _ in range(self._steps):
             rate = self._turn(yaw)
-            angles = self.trot.step(self._dt, (self._speed, rate, self._pitch), measured, scene.packed, scene.lower_ground)
+            x, y, z = measured[: gait.TRUNK_Z + 1].tolist()
+            ahead, left, rate = give_way(
+                scene.packed,
+                scene.lower_ground,
+                FOOTPRINT,
+                (x, y, yaw),
+                z - self._height,
+                (self._speed, rate),
+                self._limits,
+            )
+            command = (ahead, left, rate, self._pitch)
+            angles = self.trot.step(self._dt, command, measured, scene.packed, scene.lower_ground)
             self._set_motors(
                 self._body,
                 self._joints,
@@ -244,9 +257,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         :return: rad/s
         """
         walking = self.preset.gait
-        # A turn begins where the last one will have brought the heading; in the end, the target counts.
-        self._ahead *= self._forgotten
-        error = self._target_yaw + self._ahead - self._reference
+        error = self._target_yaw - self._reference
         rate = max(-MAX_YAW_RATE, min(MAX_YAW_RATE, YAW_GAIN * error))
         self._reference += rate * self._dt
         # Held back by a wall, say, the robot is not to swing round once it is free.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bullet_tasks import kernels
-from bullet_tasks.robots import gait
+from bullet_tasks.robots import gait, gait_kernels, gait_walls
 from bullet_tasks.robots.gait import FORE, HIP_X, HIP_Y, N_LEGS, SIDE, STANCE_WIDTH, Gait, Trot
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Cylinder
@@ -28,7 +28,7 @@ def standing(x=0.0, y=0.0, yaw=0.0, forward=0.0, z=None):
 
 def feet_from_angles(angles):
     """Where joint angles put the feet in the trunk's frame, ``(4, 3)``."""
-    places = np.array([gait.foot_place(angles[i], SIDE[i]) for i in range(N_LEGS)])
+    places = np.array([gait_kernels.foot_place(angles[i], SIDE[i]) for i in range(N_LEGS)])
     places[:, 0] += FORE * HIP_X
     places[:, 1] += SIDE * HIP_Y
     return places
@@ -40,22 +40,22 @@ def test_leg_angles_and_foot_place_are_inverse(side):
     angles = np.empty(3)
     for _ in range(200):
         place = (rng.uniform(-0.1, 0.1), side * rng.uniform(0.05, 0.15), rng.uniform(-0.3, -0.2))
-        gait.leg_angles(*place, side, angles)
-        assert gait.foot_place(angles, side) == pytest.approx(place, abs=1e-9)
+        gait_kernels.leg_angles(*place, side, angles)
+        assert gait_kernels.foot_place(angles, side) == pytest.approx(place, abs=1e-9)
         assert angles[2] < 0.0, "the knee bends backwards"
 
 
 def test_an_upright_leg_by_hand():
     """A foot 0.2 m below the hip's plane of two links of 0.2 m: an equilateral triangle."""
     angles = np.empty(3)
-    gait.leg_angles(0.0, gait.HIP_LENGTH, -0.2, 1.0, angles)
+    gait_kernels.leg_angles(0.0, gait.HIP_LENGTH, -0.2, 1.0, angles)
     assert angles == pytest.approx([0.0, math.pi / 3.0, -2.0 * math.pi / 3.0], abs=1e-9)
 
 
 def test_a_place_out_of_reach_is_pulled_into_it():
     angles = np.empty(3)
     for place in ((0.0, gait.HIP_LENGTH, -1.0), (0.6, 0.3, -0.1), (0.0, 0.0, 0.0), (0.0, 0.1, 0.3)):
-        gait.leg_angles(*place, 1.0, angles)
+        gait_kernels.leg_angles(*place, 1.0, angles)
         assert np.isfinite(angles).all()
         assert abs(angles[0]) <= 0.802851 and -2.696534 <= angles[2] <= -0.916298, "joint limits of a1.urdf"
 
@@ -67,7 +67,7 @@ def test_diagonal_legs_step_together_and_the_duty_is_kept():
     # A whole number of strides.
     n = round(100 * trot.gait.period / DT)
     for _ in range(n):
-        trot.step(DT, (0.5, 0.0, 0.0), standing(forward=0.5), HALL.packed, HALL.lower_ground)
+        trot.step(DT, (0.5, 0.0, 0.0, 0.0), standing(forward=0.5), HALL.packed, HALL.lower_ground)
         swinging.append(trot.swinging)
     swinging = np.array(swinging)
     assert np.array_equal(swinging[:, 0], swinging[:, 3]) and np.array_equal(swinging[:, 1], swinging[:, 2])
@@ -75,8 +75,8 @@ def test_diagonal_legs_step_together_and_the_duty_is_kept():
     assert swinging.mean(axis=0) == pytest.approx(1.0 - trot.gait.duty, abs=0.01)
 
 
-@pytest.mark.parametrize("speed, yaw_rate", [(0.7, 0.0), (0.0, 1.0), (0.5, -1.0)])
-def test_standing_feet_stay_in_place_on_the_ground(speed, yaw_rate):
+@pytest.mark.parametrize("speed, aside, yaw_rate", [(0.7, 0.0, 0.0), (0.0, 0.0, 1.0), (0.5, 0.0, -1.0), (0.2, 0.3, 0.0)])
+def test_standing_feet_stay_in_place_on_the_ground(speed, aside, yaw_rate):
     """The trunk moves as commanded, so a standing foot moves backwards in its frame and not at all in the world."""
     trot = Trot(Gait(acceleration=1e6, turn_acceleration=1e6))
     trot.reset(0.0)
@@ -84,11 +84,11 @@ def test_standing_feet_stay_in_place_on_the_ground(speed, yaw_rate):
     before, drifts = None, []
     for _ in range(240):
         measured = standing(x, y, yaw, speed)
-        measured[gait.YAW_RATE] = yaw_rate
-        trot.step(DT, (speed, yaw_rate, 0.0), measured, HALL.packed, HALL.lower_ground)
+        measured[gait.SIDEWAYS], measured[gait.YAW_RATE] = aside, yaw_rate
+        trot.step(DT, (speed, aside, yaw_rate, 0.0), measured, HALL.packed, HALL.lower_ground)
         yaw += yaw_rate * DT
-        x += speed * math.cos(yaw) * DT
-        y += speed * math.sin(yaw) * DT
+        x += (speed * math.cos(yaw) - aside * math.sin(yaw)) * DT
+        y += (speed * math.sin(yaw) + aside * math.cos(yaw)) * DT
         c, s = math.cos(yaw), math.sin(yaw)
         feet = trot.feet[:, :2] @ np.array([[c, s], [-s, c]]) + (x, y)
         down = ~trot.swinging
@@ -105,7 +105,7 @@ def test_joint_angles_put_the_feet_where_they_are_to_be():
     trot = Trot(Gait())
     trot.reset(0.0)
     for _ in range(100):
-        angles = trot.step(DT, (0.7, 0.5, 0.0), standing(forward=0.7), HALL.packed, HALL.lower_ground)
+        angles = trot.step(DT, (0.7, 0.0, 0.5, 0.0), standing(forward=0.7), HALL.packed, HALL.lower_ground)
         assert feet_from_angles(angles) == pytest.approx(trot.feet, abs=1e-6)
 
 
@@ -113,7 +113,7 @@ def test_a_commanded_pitch_tilts_the_standing_feet():
     """Nose down: front feet higher in the trunk's frame, rear feet lower."""
     trot = Trot(Gait(pitch_rate=1e6))
     trot.reset(0.0)
-    angles = trot.step(DT, (0.0, 0.0, 0.3), standing(), HALL.packed, HALL.lower_ground)
+    angles = trot.step(DT, (0.0, 0.0, 0.0, 0.3), standing(), HALL.packed, HALL.lower_ground)
     heights = feet_from_angles(angles)[:, 2]
     down = ~trot.swinging
     assert down[FORE > 0].any() and down[FORE < 0].any()
@@ -122,7 +122,8 @@ def test_a_commanded_pitch_tilts_the_standing_feet():
 
 def test_columns_of_a_scene_are_those_of_the_kernels():
     names = ("X", "Y", "COS", "SIN", "HALF_X", "HALF_Y", "BOTTOM", "TOP", "ROUND", "SOLID", "FLOOR")
-    assert [getattr(gait, f"_{name}") for name in names] == [getattr(kernels, name) for name in names]
+    for module in (gait_kernels, gait_walls):
+        assert [getattr(module, f"_{name}") for name in names] == [getattr(kernels, name) for name in names]
     assert len(names) == kernels.N_COLUMNS
 
 
@@ -136,7 +137,7 @@ def test_a_foot_can_stand_where_a_floor_is_and_no_wall():
     scene = SceneSpec(shapes, lower_ground=-1.0)
 
     def at(x, y):
-        return gait.standing_height(scene.packed, scene.lower_ground, x, y, 0.05)
+        return gait_kernels.standing_height(scene.packed, scene.lower_ground, x, y, 0.05)
 
     assert at(0.0, 0.0) == 0.0 and at(0.0, 0.5) == 0.0, "a marker is not solid"
     assert at(0.0, 1.5) == -1.0
@@ -149,13 +150,13 @@ def test_a_foot_can_stand_where_a_floor_is_and_no_wall():
 def test_a_foothold_beyond_an_edge_is_moved_back_by_as_little_as_possible(yaw):
     margin = 0.05
     for over in (-0.2, -0.06, -0.04, 0.0, 0.05):
-        x, y, height = gait.foothold(PLATFORM.packed, PLATFORM.lower_ground, 0.3, 1.0 + over, 0.0, margin, yaw)
+        x, y, height = gait_kernels.foothold(PLATFORM.packed, PLATFORM.lower_ground, 0.3, 1.0 + over, 0.0, margin, yaw)
         moved = math.hypot(x - 0.3, y - 1.0 - over)
         assert height == 0.0 and y <= 1.0 - margin + 1e-9
         needed = max(0.0, over + margin)
         # Places are 1 cm apart along eight directions, of which one is within an eighth of a half turn.
         assert needed - 1e-9 <= moved <= needed / math.cos(math.pi / 8.0) + 0.011
-    nowhere = gait.foothold(PLATFORM.packed, PLATFORM.lower_ground, 0.3, 2.0, 0.0, margin, yaw)
+    nowhere = gait_kernels.foothold(PLATFORM.packed, PLATFORM.lower_ground, 0.3, 2.0, 0.0, margin, yaw)
     assert nowhere == (0.3, 2.0, 0.0), "the foot is put down where it was to go, at its old height"
 
 
@@ -166,7 +167,7 @@ def test_a_step_is_taken_at_its_height():
             Box("high", (2.0, 0.0, -0.45), (1.0, 1.0, 0.53), floor=True),
         )
     )
-    assert gait.foothold(stairs.packed, stairs.lower_ground, 1.5, 0.0, 0.0, 0.05, 0.0)[2] == pytest.approx(0.08)
+    assert gait_kernels.foothold(stairs.packed, stairs.lower_ground, 1.5, 0.0, 0.0, 0.05, 0.0)[2] == pytest.approx(0.08)
 
 
 @pytest.mark.parametrize(
@@ -176,6 +177,7 @@ def test_a_step_is_taken_at_its_height():
         ({"duty": 1.0}, "duty"),
         ({"height": 0.5}, "height.*reach.*0.5"),
         ({"period": 0.0}, "period.*positive"),
+        ({"wall_time": 0.0}, "wall_time.*positive"),
         ({"clearance": -0.1}, "clearance.*0 or more.*-0.1"),
         ({"speed_trim": math.nan}, "speed_trim.*finite"),
     ],
@@ -190,7 +192,7 @@ def test_every_field_has_its_place_in_the_packed_gait():
     packed = Gait().packed()
     assert len(packed) == len(fields)
     for i, name in enumerate(fields):
-        assert getattr(gait, f"_{name.upper()}") == i and packed[i] == getattr(Gait(), name)
+        assert getattr(gait_kernels, f"_{name.upper()}") == i and packed[i] == getattr(Gait(), name)
 
 
 def test_the_trot_stands_under_its_hips_after_a_reset():

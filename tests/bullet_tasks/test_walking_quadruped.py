@@ -11,7 +11,7 @@ from benchmarks.calibrate_quadruped import DECISION, FLOOR, differences
 from benchmarks.gait import crossings, stairs
 from bullet_tasks import ENV_IDS
 from bullet_tasks.ends import Outcome
-from bullet_tasks.robots.quadruped import BODY_HEIGHT, SUBSTEP, WALKING_SPEED, QuadrupedCommand, make_quadruped
+from bullet_tasks.robots.quadruped import BODY_HEIGHT, BODY_RADIUS, SUBSTEP, WALKING_SPEED, QuadrupedCommand, make_quadruped
 from bullet_tasks.robots.walking_quadruped import FAST, MAX_PITCH, MAX_SPEED, WalkingPreset, WalkingQuadruped
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box
@@ -21,6 +21,7 @@ QUADRUPED_TASKS = [
     env_id for env_id in ENV_IDS if env_id in {"LateralChoice-v0", "SquareMaze-v0", "SignpostNav-v0", "MidpointChoice-v0"}
 ]
 WALL = Box("wall", (1.1, 0.0, 0.5), (0.1, 3.0, 0.5))
+CURB = Box("curb", (1.1, 0.0, 0.175), (0.1, 3.0, 0.175))
 LEDGE = SceneSpec((Box("ledge", (0.0, 0.0, -0.5), (1.5, 1.5, 0.5), floor=True),), lower_ground=-1.0)
 
 
@@ -160,6 +161,40 @@ def test_a_wall_stops_it_and_lets_it_go_again(make, angle):
     assert away[-1].x < 0.2 and not away[-1].in_contact and not robot.fallen
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_it_turns_before_a_curb_as_in_the_open(make, side):
+    """No shoulder, knee or foot is caught: the trunk is moved out of the way of the turn."""
+    turns = []
+    for scene in (FLOOR, SceneSpec((*FLOOR.shapes, CURB))):
+        robot = make(scene)
+        robot.reset(0.45, 0.0, 0.0, 0.0)
+        states = walk(robot, 0.0, 1.5)
+        if scene is not FLOOR:
+            assert states[-1].x == pytest.approx(1.0 - BODY_RADIUS, abs=0.03), "it comes as near as the body without legs"
+        for _ in range(4):
+            robot.command(QuadrupedCommand(WALKING_SPEED, robot.state.yaw + side * math.pi / 4.0))
+            for _ in range(DECISION):
+                robot.substep()
+        turns.append(side * robot.state.yaw)
+        assert not robot.fallen
+    assert turns[0] > 1.5 and turns[1] > 0.8 * turns[0]
+
+
+def test_neither_hard_turns_nor_curbs_make_it_fall(make):
+    """From side to side at random, in the open and on a road of 1.3 m between curbs 0.35 m high."""
+    curbs = [Box(f"curb_{i}", (0.0, side * 0.75, 0.175), (20.0, 0.1, 0.175)) for i, side in enumerate((1.0, -1.0))]
+    for scene in (FLOOR, SceneSpec((*FLOOR.shapes, *curbs))):
+        robot, rng = make(scene), np.random.default_rng(1)
+        for phase in (0.0, 0.4):
+            robot.reset(0.0, 0.0, 0.0, 0.5, phase)
+            for _ in range(24):
+                turn = float(rng.choice((-1.0, 1.0))) * math.pi / 4.0
+                robot.command(QuadrupedCommand(WALKING_SPEED, robot.state.yaw + turn))
+                for _ in range(DECISION):
+                    robot.substep()
+            assert not robot.fallen and (scene is FLOOR or abs(robot.state.y) < 0.5)
+
+
 def test_beyond_an_edge_it_falls_which_ends_the_episode(make):
     robot = make(LEDGE)
     robot.reset(0.5, 0.0, 0.0, 0.0)
@@ -239,6 +274,8 @@ def test_the_accurate_preset_walks_too():
     robot.reset(0.0, 0.0, 0.0, 0.0)
     end = walk(robot, 0.0, 2.0)[-1]
     assert end.x == pytest.approx(1.3, abs=0.15) and abs(end.y) < 0.1 and not robot.fallen
+    end = walk(robot, 1.5, 2.0)[-1]
+    assert end.yaw == pytest.approx(1.5, abs=0.15) and end.y > 0.7 and not robot.fallen
     world.close()
 
 
