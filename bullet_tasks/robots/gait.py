@@ -101,8 +101,8 @@ class Gait:
     :param heading_slack: how far the heading may lag behind before what it follows waits for it, rad
     :param wall_time: time in which the way that is left to a wall would be walked, s: the nearer it is, the slower
     :param sidestep: greatest speed at which the trunk is moved out of a wall's way, m/s
-    :param turn_room: how much further from walls the trunk is kept for every rad/s above a slow turn's 0.8, so that no shoulder
-        or knee is caught, m s/rad
+    :param turn_room: how much further from walls the trunk is kept for every rad/s above a slow turn's 0.8, so that no
+        shoulder or knee is caught, m s/rad
     :raises ValueError: if a number is not a possible choice
     """
 
