@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -62,6 +63,7 @@ class PolicyFeatures(BaseFeaturesExtractor):
     :param mean_input: whether the encoder's mean is seen
     :param privileged_gain: factor on privileged values, whose scale is 0.2-0.25 by contract
     :param normalize_common: whether the common observation is brought to zero mean and unit variance
+    :param one_hot: discrete dimensions that are seen as one number for each of their values, and these; None: there are none
     """
 
     def __init__(
@@ -72,11 +74,16 @@ class PolicyFeatures(BaseFeaturesExtractor):
         mean_input: bool,
         privileged_gain: float,
         normalize_common: bool,
+        one_hot: dict[int, list[float]] | None = None,
     ):
         n_privileged = get_flattened_obs_dim(observation_space[PRIVILEGED])
         n_common = get_flattened_obs_dim(observation_space[COMMON])
-        super().__init__(observation_space, n_common + n_privileged * (1 + uncertainty_input + mean_input))
+        one_hot = one_hot or {}
+        n_seen = n_privileged + sum(len(values) - 1 for values in one_hot.values())
+        super().__init__(observation_space, n_common + n_seen * (1 + mean_input) + n_privileged * uncertainty_input)
         self.privileged_key = privileged_key
+        self.one_hot = {dim: sorted(values) for dim, values in one_hot.items()}
+        self.continuous = [dim for dim in range(n_privileged) if dim not in one_hot]
         self.uncertainty_input, self.mean_input = uncertainty_input, mean_input
         self.privileged_gain = privileged_gain
         self.common_normalizer = RunningNormalizer(n_common) if normalize_common else nn.Identity()
@@ -86,14 +93,34 @@ class PolicyFeatures(BaseFeaturesExtractor):
         :param obs: batch by key, ``(n, ...)``
         :return: ``(n, features_dim)``
         """
-        parts = [self.common_normalizer(obs[COMMON]), obs[self.privileged_key] * self.privileged_gain]
+        parts = [self.common_normalizer(obs[COMMON]), self._seen(obs[self.privileged_key])]
         if self.uncertainty_input:
             # Log scale, as the reward transformation: INITIAL_STD -> 0, MIN_STD -> -1. The warm-up knows little but 0, so
             # that certainty, when it comes, does not act through weights that grew as a bias.
             parts.append(-th.log(obs[UNCERTAINTY].clamp(min=MIN_STD) / INITIAL_STD) / math.log(MIN_STD / INITIAL_STD))
         if self.mean_input:
-            parts.append(obs[BELIEF] * (self.privileged_gain * BELIEF_SHARE))
+            parts.append(self._seen(obs[BELIEF]) * BELIEF_SHARE)
         return th.cat(parts, dim=1)
+
+    def _seen(self, privileged: th.Tensor) -> th.Tensor:
+        if not self.one_hot:
+            return privileged * self.privileged_gain
+        parts = [privileged[:, self.continuous] * self.privileged_gain]
+        parts += [one_hot(privileged[:, dim], values) for dim, values in self.one_hot.items()]
+        return th.cat(parts, dim=1)
+
+
+def one_hot(x: th.Tensor, values: Sequence[float]) -> th.Tensor:
+    """
+    How much of each value a number is: 1 of the one that it equals, shares of its two neighbours in between.
+
+    :param x: ``(n,)``
+    :param values: at least two, in order
+    :return: ``(n, n_values)``, not negative, each row's sum is 1
+    """
+    v = th.tensor(values, dtype=x.dtype, device=x.device)
+    passed = ((x[:, None] - v[:-1]) / (v[1:] - v[:-1])).clamp(0.0, 1.0)
+    return F.pad(passed, (1, 0), value=1.0) - F.pad(passed, (0, 1))
 
 
 class USPLPolicy(ActorCriticPolicy):
@@ -113,7 +140,9 @@ class USPLPolicy(ActorCriticPolicy):
     :param memory: the encoder's memory, "gru", "transformer" or "max"
     :param encoder_kwargs: replaces single entries of the preset
     :param discrete_privileged: discrete dimensions of the privileged observation and their values, for an encoder with
-        ``encoder_kwargs=dict(categorical=True)``
+        ``encoder_kwargs=dict(categorical=True)`` and for ``one_hot``
+    :param one_hot: whether actor and critic see discrete dimensions as one number for each value: what to do is often not in
+        the order of the values, and whether the third of three things is in the hand is hard to read off one number
     :param encoder_learning_rate: initial learning rate of the encoder
     :param encoder_weight_decay: weight decay of the encoder (Tables 4 and 5)
     :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)
@@ -128,7 +157,7 @@ class USPLPolicy(ActorCriticPolicy):
         ``CorrelatedGaussianDistribution``
     :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
     :param kwargs: further arguments of ``ActorCriticPolicy``
-    :raises ValueError: for a space outside the contract or an unknown preset
+    :raises ValueError: for a space outside the contract, an unknown preset, or ``one_hot`` without discrete dimensions
     """
 
     def __init__(
@@ -149,12 +178,18 @@ class USPLPolicy(ActorCriticPolicy):
         mean_input: bool = True,
         privileged_gain: float = 4.0,
         normalize_common: bool = True,
+        one_hot: bool = False,
         bounded_mean: bool = True,
         noise_correlation: float = 0.0,
         smoothing: float = 0.0,
         **kwargs: Any,
     ):
         self.contract = check_observation_space(observation_space)
+        if one_hot and not discrete_privileged:
+            raise ValueError(
+                "policy_kwargs=dict(one_hot=True), but no dimension of the privileged observation is discrete: give "
+                "`discrete_privileged`, e.g. {0: [0.0, 0.25, 0.5]}, or leave `one_hot` out."
+            )
         self.encoder_arguments: dict[str, Any] = dict(
             encoder=encoder,
             memory=memory,
@@ -171,6 +206,7 @@ class USPLPolicy(ActorCriticPolicy):
             mean_input=mean_input,
             privileged_gain=privileged_gain,
             normalize_common=normalize_common,
+            one_hot=one_hot,
         )
         for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
             if kwargs.pop(name, None) not in (None, PolicyFeatures, {}, False):
@@ -207,7 +243,9 @@ class USPLPolicy(ActorCriticPolicy):
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """ActorCriticPolicy asks for the actor's features first, then for the critic's."""
         key = TRUTH if hasattr(self, "pi_features_extractor") else PRIVILEGED
-        return PolicyFeatures(self.observation_space, key, **self.feature_arguments)  # type: ignore[arg-type]
+        discrete = self.encoder_arguments["discrete_privileged"] or {}
+        arguments = {**self.feature_arguments, "one_hot": discrete if self.feature_arguments["one_hot"] else {}}
+        return PolicyFeatures(self.observation_space, key, **arguments)  # type: ignore[arg-type]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -242,6 +280,18 @@ class USPLPolicy(ActorCriticPolicy):
         for features in (self.pi_features_extractor, self.vf_features_extractor):
             if isinstance(features.common_normalizer, RunningNormalizer):
                 features.common_normalizer.update(th.as_tensor(common, dtype=th.float32, device=self.device))
+
+    def restart(self, lr_schedule: Schedule) -> None:
+        """
+        Forget what actor and critic have learned; the encoder and the statistics of observations stay.
+
+        :param lr_schedule: learning rate of actor and critic
+        """
+        encoder = self.encoder
+        del self.encoder  # the optimizer of actor and critic must not hold it
+        self._build(lr_schedule)
+        self.encoder = encoder
+        self.to(self.device)
 
     def set_action_std(self, std: float | Sequence[float] | np.ndarray) -> None:
         """

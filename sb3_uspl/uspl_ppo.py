@@ -75,6 +75,8 @@ class USPLPPO(PPO):
     :param policy_warmup: whether actor and critic learn during the warm-up. Without it, the policy of the warm-up is an
         untrained one: the encoder learns from its strolls, and PPO meets blurring and reward transformation before it has
         learned to do without information.
+    :param policy_restart: whether actor and critic start anew after the warm-up. What they learned there serves the encoder's
+        experience; one that has learned to do without information may be too sure of itself to look for any.
     :param ramp_timesteps: decisions over which the progress coefficient l rises to 1 (C.3.1: 300 epochs). None: 50 % of the
         first ``learn``.
     :param blur: privileged blurring, Eq. 3 and 4
@@ -159,6 +161,7 @@ class USPLPPO(PPO):
         action_noise_timesteps: int = 500_000,
         warmup_timesteps: int | None = None,
         policy_warmup: bool = True,
+        policy_restart: bool = False,
         ramp_timesteps: int | None = None,
         blur: bool = True,
         reward_scaling: bool = True,
@@ -233,7 +236,7 @@ class USPLPPO(PPO):
         self.action_std, self.action_std_floor = action_std, action_std_floor
         self.action_noise_time, self.action_noise_timesteps = action_noise_time, action_noise_timesteps
         self.warmup_timesteps, self.ramp_timesteps = warmup_timesteps, ramp_timesteps
-        self.policy_warmup = policy_warmup
+        self.policy_warmup, self.policy_restart = policy_warmup, policy_restart
         self.blur, self.reward_scaling = blur, reward_scaling
         self.uncertainty_input, self.mean_input = uncertainty_input, mean_input and uncertainty_input
         self.c_min, self.c_max, self.delta = c_min, c_max, delta
@@ -374,6 +377,8 @@ class USPLPPO(PPO):
         # `model.env` stays what the user gave (callbacks, VecNormalize, set_env rely on it); only experience is transformed.
         wrapper = self._rollout_env
         assert wrapper is not None and env is self.env
+        if self.policy_restart and wrapper.progress == 0.0 < self.progress:
+            self.policy.restart(self.lr_schedule)
         wrapper.progress = self.progress
         if self.mismatch_hold_time is None:
             wrapper.redraw_mismatch()

@@ -12,6 +12,7 @@ import bullet_tasks  # noqa: F401
 from bullet_tasks.vec_env import BulletVecEnv
 from sb3_uspl import RMA, USPLPPO
 from sb3_uspl.encoder import ObservationEncoder
+from sb3_uspl.policies import one_hot
 from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
 from tests.sb3_uspl.toy import ToyEnv
 
@@ -117,8 +118,24 @@ def test_a_loaded_model_still_knows(tmp_path):
     assert loaded._uncertainty_config.discrete_privileged == {1: VALUES}
 
 
+def test_actor_and_critic_can_see_one_number_for_each_value():
+    x = th.tensor([-0.3, -0.25, -0.0625, 0.25, 0.3])
+    expected = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.25, 0.75, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
+    th.testing.assert_close(one_hot(x, VALUES), th.tensor(expected))
+    model = USPLPPO("MlpPolicy", make_vec_env(MixedEnv, 4), policy_kwargs=dict(one_hot=True), **FAST)
+    features = model.policy.pi_features_extractor
+    seen = {"common": th.zeros(1, 2), "privileged": th.tensor([[0.1, 0.25, 0.2]]), "uncertainty": th.full((1, 3), 0.5)}
+    expected = [0.0, 0.0, 0.4, 0.8, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.3, 0.0]
+    outputs = features({**seen, "belief": th.zeros(1, 3)})
+    assert features.features_dim == outputs.shape[1] == len(expected)
+    assert outputs[0].tolist() == pytest.approx(expected)
+    model.learn(128)
+    with pytest.raises(ValueError, match="one_hot"):
+        USPLPPO("MlpPolicy", make_vec_env(ToyEnv, 4), policy_kwargs=dict(one_hot=True), **FAST)
+
+
 def test_a_categorical_belief_is_learned_saved_and_loaded(tmp_path):
-    kwargs = dict(encoder_kwargs=dict(categorical=True))
+    kwargs = dict(one_hot=True, encoder_kwargs=dict(categorical=True))
     model = USPLPPO("MlpPolicy", make_vec_env(MixedEnv, 4), policy_kwargs=kwargs, **FAST)
     before = model.policy.encoder.discrete["1"].logits[-1].weight.detach().clone()
     model.learn(128)

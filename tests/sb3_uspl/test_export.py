@@ -43,7 +43,7 @@ def make_model(algorithm=USPLPPO, memory="gru", target=None, action_space=None, 
     sizes = dict(hidden=(16,), trunk=(16,), embedding=(16,)) | (sizes or {})
     if algorithm is RESeLPPO:  # it hears its own continuous action: at high frequencies, untrained, rounding errors grow
         sizes["frequencies"] = 0
-    kwargs = dict(memory=memory, encoder_kwargs=sizes)
+    kwargs = dict(memory=memory, encoder_kwargs=sizes) | (dict(one_hot=True) if more else {})
     model = algorithm("MlpPolicy", venv, n_steps=16, batch_size=64, policy_kwargs=kwargs, device="cpu", seed=0, **more)
     rng = th.Generator().manual_seed(0)
     with th.no_grad():  # an untrained policy hardly acts
