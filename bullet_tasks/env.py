@@ -115,6 +115,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         start = self.task.reset(self.np_random)
         self.world.place(start.placements)
         scene = self.scene
+        self.robot.vary(self.np_random)
         state = self.robot.reset(start.x, start.y, scene.ground_height(start.x, start.y), start.yaw)
         self.task.begin(state, scene)
         self._privileged = self.task.privileged()

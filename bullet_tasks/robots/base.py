@@ -3,6 +3,8 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
+import numpy as np
+
 from bullet_tasks.ends import Judge, Outcome
 from bullet_tasks.simulation import Simulation
 
@@ -54,6 +56,13 @@ class Robot(ABC, Generic[CommandT]):
     state: RobotState
     fallen: bool = False
     """Whether the robot has tipped over or sunk down since it was placed, which ends the episode; only one on legs can."""
+
+    def vary(self, rng: np.random.Generator) -> None:
+        """
+        Draw what the pose of the next ``reset`` leaves open. Nothing, but for a robot on legs: its stride's phase.
+
+        :param rng: the episode's random generator
+        """
 
     @abstractmethod
     def reset(self, x: float, y: float, ground: float, yaw: float) -> RobotState:

@@ -100,6 +100,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         self._dt = 1.0 / preset.physics_rate
         self._steps = round(SUBSTEP * preset.physics_rate)
         self._speed = self._target_yaw = self._reference = self._pitch = 0.0
+        self._phase = 0.0
         self._height = FOOT_RADIUS + preset.gait.height
         self._limits = (preset.gait.wall_time, preset.gait.sidestep, preset.gait.turn_room)
         self._measured = np.zeros(gait.N_MEASUREMENTS)
@@ -142,7 +143,16 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
             path.write_text(a1_model.urdf())
             return self._client.loadURDF(str(path), place, flags=flags | pybullet.URDF_USE_MATERIAL_COLORS_FROM_MTL)
 
-    def reset(self, x: float, y: float, ground: float, yaw: float, phase: float = 0.0) -> RobotState:
+    def vary(self, rng: np.random.Generator) -> None:
+        """
+        Begin the next episode anywhere in the stride (see base class). Where the start is always the same, as in Square Maze,
+        so would every episode be that has the same goal.
+
+        :param rng: the episode's random generator
+        """
+        self._phase = float(rng.uniform())
+
+    def reset(self, x: float, y: float, ground: float, yaw: float, phase: float | None = None) -> RobotState:
         """
         Put the robot somewhere, standing (see base class).
 
@@ -150,9 +160,9 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         :param y: m
         :param ground: height of the floor there, m
         :param yaw: rad
-        :param phase: of the stride that the robot will begin with, 0 to 1
+        :param phase: of the stride that the robot will begin with, 0 to 1; None: what ``vary`` has drawn, else 0
         """
-        self.trot.reset(ground, phase)
+        self.trot.reset(ground, self._phase if phase is None else phase)
         self._speed, self._target_yaw, self._reference, self._pitch = 0.0, yaw, yaw, 0.0
         z = ground + self._height
         angles = self.trot.angles.ravel().tolist()

@@ -268,6 +268,20 @@ def test_the_tasks_run_unchanged(env_id):
     twin.close()
 
 
+def test_episodes_begin_anywhere_in_the_stride_and_seeds_repeat_them():
+    env = gymnasium.make("SquareMaze-v0", physics="full")
+
+    def joints(seed):
+        env.reset(seed=seed)
+        env.step(env.action_space.low * 0.0)
+        return env.unwrapped.robot.trot.angles.copy()
+
+    first, second, again = joints(1), joints(2), joints(1)
+    assert np.abs(first - second).max() > 0.02
+    np.testing.assert_array_equal(first, again)
+    env.close()
+
+
 def test_the_accurate_preset_walks_too():
     world = World(FLOOR)
     robot = make_quadruped(world, "full_accurate")
