@@ -77,7 +77,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.world = World(task.scene, gui=render_mode == "human")
         try:
             self.robot = make_robot(self.world)
-            if render_mode is not None:
+            if render_mode == "human":
                 self.robot.appear(self.world.simulation)
             substeps = task.decision_period / self.robot.substep_period
             if round(substeps) < 1 or abs(substeps - round(substeps)) > _PERIOD_TOLERANCE:

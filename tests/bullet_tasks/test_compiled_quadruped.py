@@ -280,15 +280,19 @@ def test_episodes_of_every_task_end_the_same_way(env_id):
     assert n_same >= 18
 
 
-def test_no_pybullet_client_without_a_picture(monkeypatch):
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
+def test_no_pybullet_client_without_a_picture(monkeypatch, render_mode):
     def refuse(*arguments, **keywords):
         raise AssertionError("a client was opened")
 
     monkeypatch.setattr("bullet_tasks.world.Simulation", refuse)
-    env = gymnasium.make("LateralChoice-v0", physics="compiled")
+    env = gymnasium.make("LateralChoice-v0", physics="compiled", render_mode=render_mode)
     env.reset(seed=0)
     env.step(np.zeros(1, np.float32))
     assert not env.unwrapped.world.simulated
+    if render_mode is not None:
+        with pytest.raises(AssertionError, match="client"):
+            env.render()
     env.close()
     with pytest.raises(AssertionError, match="client"):
         gymnasium.make("LateralChoice-v0", physics="kinematic")
