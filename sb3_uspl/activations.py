@@ -27,6 +27,8 @@ def recoverable_tanh(x: th.Tensor) -> th.Tensor:
     :param x: any shape
     :return: tanh(x)
     """
+    if th.jit.is_tracing() or not th.is_grad_enabled():  # TorchScript cannot hold a gradient of one's own
+        return th.tanh(x)
     return _RecoverableTanh.apply(x)  # type: ignore[no-untyped-call, no-any-return]
 
 
