@@ -243,7 +243,7 @@ def test_a_categorical_belief_learns_a_value_between_others():
     truth = 0.2 * th.randn(512, 3)
     truth[:, 1] = th.tensor(VALUES)[index]
     tokens, lengths = {"common": common, "previous_action": th.zeros(512, 1)}, th.ones(512, dtype=th.long)
-    for _ in range(100):
+    for _ in range(200):
         loss = encoder.loss(encoder(tokens, lengths)[0], truth)
         optimizer.zero_grad()
         loss.backward()
