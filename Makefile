@@ -34,7 +34,7 @@ benchmark-learning: $(INSTALLED)
 # Runs every text in notebooks/ and stores it as a notebook with its outputs; minutes each. One: make notebooks NOTEBOOKS=notebooks/01_the_gap.py
 NOTEBOOKS ?= $(wildcard notebooks/*.py)
 notebooks: $(INSTALLED)
-	$(BIN)/pip install -q -c constraints.txt --no-build-isolation -e ".[zoo,dev,notebooks]"
+	$(BIN)/pip install -q -c constraints.txt --no-build-isolation -e ".[zoo,dev,experiments,notebooks]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m jupytext --to ipynb --execute --set-kernel python3 $(NOTEBOOKS)
 
 # The site, into build/docs; a warning is an error.
