@@ -52,7 +52,7 @@ from sb3_uspl.evaluation import EVALUATION_SEED
 from sb3_uspl.pictures import DEPLOYMENT_COLOUR, PRIVILEGED_COLOUR, SIGMA_COLOUR
 
 th.set_num_threads(1)
-seeds = EVALUATION_SEED + np.arange(3 if FAST else 100)
+seeds = EVALUATION_SEED + np.arange(3 if FAST else 50)
 
 # %% [markdown]
 # Both policies, deployed and privileged, are one network that is shown different things, so one loop plays them all. `note` says
@@ -178,7 +178,7 @@ print("hover held:", story["success"])
 
 # %% [markdown]
 # Purple is the belief about the three biases, gold the truth, which is hidden from the policy. In the air, the belief is wide. On
-# the ground it closes on the truth, and the quadrotor takes off again. A hundred flights, laid on top of each other at the moment
+# the ground it closes on the truth, and the quadrotor takes off again. Fifty flights, laid on top of each other at the moment
 # of the first touch-down:
 
 # %%
@@ -269,7 +269,7 @@ def weigh(cube):
 
 
 readings = {"red": [], "green": [], "blue": []}
-for seed in np.arange(20 if FAST else 400):
+for seed in np.arange(20 if FAST else 200):
     arm_env.reset(seed=int(seed))
     for name in readings:
         readings[name].append(weigh(getattr(arm_task, name)))
@@ -305,7 +305,7 @@ def note_weighing(world):
     return {task.red: "red", task.green: "green", task.blue: "blue"}[state.held] if state.load > 0 else None
 
 
-weighings = [play(arm_env, arm, seed, note_weighing) for seed in seeds]
+weighings = [play(arm_env, arm, seed, note_weighing) | {"blue": 0.3 * (arm_task.blue - 1)} for seed in seeds]
 right = [seed for seed, story in zip(seeds, weighings, strict=True) if story["success"] and "red" in story["noted"]]
 story = play(arm_env, arm, right[0] if right else seeds[0], note_weighing, pictures=True)
 moments = range(len(story["mean"]))[:9]
@@ -315,7 +315,7 @@ print("red stands on green:", story["success"])
 
 # %% [markdown]
 # Left bar: which cube is red (-0.3 the left one, 0 the middle one, 0.3 the right one); right bar: the logarithm of the scale's
-# factor. Is this the reason why it weighs? Let us sort all the decisions of 100 episodes by what had been weighed until then.
+# factor. Is this the reason why it weighs? Let us sort all the decisions of fifty episodes by what had been weighed until then.
 
 # %%
 rows = {"nothing": [], "green only": [], "another only": [], "green and another": []}
@@ -324,23 +324,23 @@ for story in weighings:
     for t, noted in enumerate(story["noted"][:-1]):
         green, another = green or noted == "green", another or noted in ("red", "blue")
         key = list(rows)[green + 2 * another]
-        values = np.array([-0.3, 0.0, 0.3])
-        nearest = values[np.abs(story["mean"][t][0] - values).argmin()]
-        rows[key].append((*story["std"][t], abs(nearest - story["truth"][0]) < 0.01))
+        believed = story["mean"][t][0]
+        rows[key].append((*story["std"][t], abs(believed - story["truth"][0]) < abs(believed - story["blue"])))
 success = np.mean([story["success"] for story in weighings])
 length = np.mean([len(story["mean"]) for story in weighings])
 print(f"success in {success:.0%} of {len(seeds)} episodes, after {length:.1f} decisions on average")
-print("weighed so far      decisions   σ of red   σ of bias   mean nearest to the right cube")
+print("weighed so far      decisions   σ of red   σ of bias   mean nearer to red than to blue")
 for key, values in rows.items():
     if values:
-        red, bias, nearest = np.mean(values, axis=0)
-        print(f"{key:18s}  {len(values):9d}   {red:8.3f}   {bias:9.3f}   {nearest:10.0%}")
+        red, bias, right = np.mean(values, axis=0)
+        print(f"{key:18s}  {len(values):9d}   {red:8.3f}   {bias:9.3f}   {right:10.0%}")
 both = np.mean([{"green"} < {noted for noted in story["noted"] if noted} for story in weighings])
 print(f"both green and another were weighed in {both:.0%} of the episodes")
 
 # %% [markdown]
-# The table is the task's card as the encoder has learned it: green alone tells the bias, another cube alone tells neither, and both
-# together tell which one is red.
+# Line by line: before anything is weighed, which of two cubes is red is a coin's throw. Green alone tells the bias and nothing of
+# red. Another cube alone tells the bias roughly, as its mass is known roughly, and red only where the reading would be beyond the
+# range of the bias. Both together tell everything.
 #
 # ## And told that it knows?
 
@@ -356,6 +356,9 @@ drone_env.close()
 arm_env.close()
 
 # %% [markdown]
+# The drone obeys the σ that it is told; the arm hardly listens. It weighs whatever it is told, even if it is shown the truth: to weigh
+# has become what it does first. Not every agent has to be as sensitive to σ as the paper's; whether yours is, is one loop to find out.
+#
 # ## Exercises
 #
 # 1. Which of the drone's three σ could fall without landing? Write a pilot that finds out the altitude's bias in the air, and say
