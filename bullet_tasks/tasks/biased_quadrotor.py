@@ -97,7 +97,7 @@ class BiasedQuadrotorConfig:
     start_altitude: tuple[float, float] = (1.3, 2.3)
     start_tilt: float = 0.1
     middle_altitude: float = 1.25
-    altitude_range: float = 2.0
+    altitude_range: float = 2.5
     angle_range: float = 0.3
     hover: HoverLimits = field(default_factory=HoverLimits)
     decision_period: float = 0.2
@@ -152,7 +152,7 @@ class BiasedQuadrotor(Task):
         the paper's constants are made for. There is no ``target``.
 
     Action
-        Box(3) in [-1, 1]: target pitch and roll in units of 0.3 rad, target altitude 1.25 m + action * 2 m, all as the
+        Box(3) in [-1, 1]: target pitch and roll in units of 0.3 rad, target altitude 1.25 m + action * 2.5 m, all as the
         sensors read them, held for 0.2 s. The quadrotor climbs at up to 1.5 m/s and sinks at up to 1.2 m/s, in proportion to
         the altitude error.
 

@@ -156,7 +156,7 @@ def test_a_fast_touchdown_is_a_crash_and_a_slow_one_is_not(env):
         impact, terminated = 0.0, False
         while not (terminated or robot.state.landed):
             # The lower the target, the faster the touchdown; how low it is depends on the bias.
-            _, _, terminated, truncated, info = env.step(DOWN)
+            _, _, terminated, truncated, info = env.step(fly_to(-0.75))
             impact = max(impact, robot.state.impact)
             assert not truncated and not info["is_success"]
         crashes[terminated] += 1
