@@ -289,7 +289,8 @@ for key, values in rows.items():
 env.close()
 
 # %% [markdown]
-# CLAIMS
+# The ellipse is as wide as the disc until the signpost is in sight, and shrinks within a second or two of looking, and the error
+# with it. It does not become a point: an encoder that has seen so few signposts reads them coarsely, and its σ says so.
 #
 # ## Exercises
 #
