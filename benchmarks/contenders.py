@@ -3,13 +3,11 @@
 import functools
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
@@ -22,10 +20,10 @@ import bullet_tasks  # noqa: F401 (registers the environments)
 from benchmarks.machine import cores
 from bullet_tasks.vec_env import BulletVecEnv
 from sb3_uspl import RMA, USPLPPO, RESeLPPO
+from sb3_uspl._configs import CONFIGS, load_entries
 from sb3_uspl.encoder import PRESETS
 from sb3_uspl.observations import PRIVILEGED
 
-ZOO_CONFIGS = Path(__file__).resolve().parents[1] / "zoo_configs"
 _NOT_FOR_THE_MODEL = ("policy", "n_envs", "n_timesteps", "env_kwargs")
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "normalize", "frame_stack")
 _NET_ARCH = [128, 128]
@@ -105,7 +103,7 @@ def zoo_entry(algorithm: str, env_id: str) -> Settings:
     :param algorithm: ``"uspl_ppo"``, ``"rma"``, ...
     :param env_id: registered id
     """
-    entries = yaml.safe_load((ZOO_CONFIGS / f"{algorithm}.yml").read_text())
+    entries = load_entries(CONFIGS / f"{algorithm}.yml")
     entry: Settings = {**entries.get(env_id, entries["default"])}
     if isinstance(entry.get("policy_kwargs"), str):
         # As the zoo reads it.

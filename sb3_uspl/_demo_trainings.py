@@ -12,9 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO
 
-import yaml
-
-from sb3_uspl._zoo import CONFIGS
+from sb3_uspl._configs import CONFIGS, load_entries
 
 NAMES = {"uspl_ppo": "USPL", "rma": "RMA"}
 EVAL_FREQ, EVAL_EPISODES, N_EVAL_ENVS = 50_000, 100, 25
@@ -157,7 +155,7 @@ class Trainings:
 
 
 def _configured_timesteps(algo: str, env_id: str) -> int:
-    config = yaml.safe_load((CONFIGS / f"{algo}.yml").read_text())
+    config = load_entries(CONFIGS / f"{algo}.yml")
     if env_id not in config:
         raise SystemExit(f"{CONFIGS}/{algo}.yml has no entry for {env_id}, only for {sorted(config)}.")
     return int(config[env_id]["n_timesteps"])

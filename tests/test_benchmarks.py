@@ -157,7 +157,7 @@ def test_contenders_have_the_same_sizes_and_settings():
 
 def test_entries_that_wrap_environments_are_refused(tmp_path, monkeypatch):
     (tmp_path / "uspl_ppo.yml").write_text("default:\n  n_steps: 8\n  normalize: true\n")
-    monkeypatch.setattr("benchmarks.contenders.ZOO_CONFIGS", tmp_path)
+    monkeypatch.setattr("benchmarks.contenders.CONFIGS", tmp_path)
     with pytest.raises(ValueError, match="normalize"):
         zoo_settings("uspl_ppo", "LateralChoice-v0")
 

@@ -191,10 +191,13 @@ def test_every_configuration_is_accepted_by_its_algorithm(algo):
             assert set(kwargs) <= set(inspect.signature(policy).parameters)
 
 
-def test_resel_ppo_has_an_entry_for_every_environment():
-    entries = load_entries(CONFIGS / "resel_ppo.yml")
-    assert set(entries) == {"default", *filter(is_ours, gym.registry)}
-    for entry in entries.values():
+@pytest.mark.parametrize("algo", sorted(ALGORITHMS))
+def test_every_environment_has_an_entry(algo):
+    assert set(load_entries(CONFIGS / f"{algo}.yml")) == {"default", *filter(is_ours, gym.registry)}
+
+
+def test_resel_ppo_updates_with_whole_sequences():
+    for entry in load_entries(CONFIGS / "resel_ppo.yml").values():
         assert entry["batch_size"] % entry["n_steps"] == 0
 
 
