@@ -179,7 +179,7 @@ def first_sight(episode):
     return int(seen.argmax()) if seen.any() else len(seen) - 1
 
 
-training = [walk(seed) for seed in range(6 if FAST else 1200)]
+training = [walk(seed) for seed in range(6 if FAST else 5000)]
 test = [walk(10_000 + i) for i in range(6 if FAST else 120)]
 n_images = sum(len(episode[COMMON]) for episode in training)
 n_seen = sum(len(episode[COMMON]) - first_sight(episode) for episode in training)
@@ -214,7 +214,7 @@ def look(episodes):
 
 
 encoder.features.update_normalizers(collate(training)[0])
-ROUNDS, BATCH = (1, 4) if FAST else (16, 40)
+ROUNDS, BATCH = (1, 4) if FAST else (16, 100)
 optimizer = th.optim.Adam(encoder.parameters(), 2e-3)
 schedule = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, ROUNDS)
 curve, begin = [], time.process_time()

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
+from sb3_uspl.activations import RecoverableTanh
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, TARGET, is_image
 
 Tokens = dict[str, th.Tensor]
@@ -126,7 +127,8 @@ Convolutions = Sequence[tuple[int, int, int, int]]
 
 class ImageCNN(nn.Module):
     """
-    Image features: convolutions and fully connected layers with ELU between them, Tanh at the end (App. C.3.3).
+    Image features: convolutions and fully connected layers with ELU between them, Tanh at the end (App. C.3.3), one that
+    training can leave again (:class:`sb3_uspl.activations.RecoverableTanh`).
 
     Images come as they are stored; here their numbers are brought from the bounds of the space to [-0.5, 0.5].
 
@@ -160,7 +162,7 @@ class ImageCNN(nn.Module):
             n_channels = channels
         self.convolutions = nn.Sequential(*layers, nn.Flatten())
         self.fully_connected = mlp(n_channels * height * width, fully_connected)
-        self.fully_connected[-1] = nn.Tanh()
+        self.fully_connected[-1] = RecoverableTanh()
         self.width = fully_connected[-1]
         """Number of features."""
         self.low, self.range = float(space.low.min()), float(space.high.max()) - float(space.low.min())
