@@ -81,7 +81,7 @@ print({name: array.shape for name, array in episodes.items()})
 encoder = minimal.Encoder(64)
 optimizer = th.optim.Adam(encoder.parameters(), 3e-3)
 losses = [minimal.update_encoder(encoder, optimizer, episodes, [], minimal.USPL, rng) for _ in range(2 if FAST else 50)]
-test = explore(8 if FAST else 1000)
+test = explore(12 if FAST else 1000)
 with th.no_grad():
     mean, log_std, _ = encoder(th.as_tensor(test["tokens"]))
 mean, std = mean.numpy()[..., 0], log_std.exp().numpy()[..., 0]
