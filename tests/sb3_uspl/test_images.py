@@ -61,7 +61,15 @@ def test_the_papers_cnn_hand_counted():
     expected = [(32, 1, 5, 5), (32,), (64, 32, 3, 3), (64,), (128, 64 * 25 * 39), (128,), (128, 128), (128,)]
     assert shapes == expected
     kinds = [type(layer).__name__ for layer in (*cnn.convolutions, *cnn.fully_connected)]
-    assert kinds == ["Conv2d", "MaxPool2d", "ELU", "Conv2d", "ELU", "Flatten", "Linear", "ELU", "Linear", "Tanh"]
+    assert kinds == ["Conv2d", "MaxPool2d", "ELU", "Conv2d", "ELU", "Flatten", "Linear", "ELU", "Linear", "RecoverableTanh"]
+
+
+def test_saturated_image_features_learn_on():
+    cnn = ImageCNN(spaces.Box(0, 255, (1, 36, 48), np.uint8), SMALL, (64,))
+    with th.no_grad():
+        cnn.fully_connected[-2].bias.fill_(12.0)
+    cnn(th.randint(0, 256, (4, 1, 36, 48), dtype=th.uint8)).sum().backward()
+    assert max(p.grad.abs().max().item() for p in cnn.convolutions.parameters()) > 1e-4  # tanh(12) has a slope of 1e-10
 
 
 def test_the_papers_layers_beside_the_image():
