@@ -178,7 +178,8 @@ class Grid:
             self._measure(folder)
         elif job.first and folder.decisions() <= job.first:
             aside = folder.start_over()
-            self._say(f"{cell.name}: could not continue from its checkpoint (now in {aside}), starts again")
+            why = f"could not continue from its checkpoint (now in {aside}), starts again"
+            self._say(f"{cell.name}: {why}; {_end_of(folder.log)}")
             self._train(folder, None)
         else:
             self._fail(folder, status)
@@ -186,8 +187,7 @@ class Grid:
     def _fail(self, folder: CellFolder, status: int) -> None:
         reason = f"exit status {status}, see {folder.log}"
         self.failed[folder.cell.name] = reason
-        tail = "\n".join(folder.log.read_text().splitlines()[-LOG_TAIL:])
-        self._say(f"{folder.cell.name}: FAILED, {reason}; the end of it:\n{tail}")
+        self._say(f"{folder.cell.name}: FAILED, {reason}; {_end_of(folder.log)}")
 
     def _stop(self) -> None:
         for job in self.running:
@@ -226,6 +226,10 @@ class Grid:
 
     def _say(self, text: str) -> None:
         print(f"[{_clock(time.monotonic() - self._begin)}] {text}", flush=True)
+
+
+def _end_of(log: Path) -> str:
+    return "the end of its log:\n" + "\n".join(log.read_text().splitlines()[-LOG_TAIL:])
 
 
 def _clock(seconds: float) -> str:

@@ -14,6 +14,8 @@ from sb3_uspl.experiments.plan import Cell
 
 CHECKPOINT = "rl_model_*_steps.zip"
 CHECKPOINTS_PER_TRAINING = 20
+_LAST_MEMBER = "system_info.txt"
+"""What ``save`` of Stable-Baselines3 writes last."""
 _STEPS = "time/total_timesteps"
 
 
@@ -87,7 +89,7 @@ class CellFolder:
         """:return: the latest whole checkpoint, and the decisions it was saved after"""
         saved = [(int(path.stem.split("_")[2]), path) for attempt in self.attempts() for path in attempt.path.glob(CHECKPOINT)]
         for steps, path in sorted(saved, reverse=True):
-            if steps < self.cell.timesteps and _is_whole(path):
+            if steps < self.cell.timesteps and _is_whole(path, _LAST_MEMBER):
                 return path, steps
         return None
 
@@ -168,9 +170,10 @@ def evaluations(run: Path) -> dict[str, np.ndarray] | None:
         return dict(data)
 
 
-def _is_whole(path: Path) -> bool:
+def _is_whole(path: Path, member: str | None = None) -> bool:
+    """A zip file that was being written when its process was asked to end can be sound and lack its last members."""
     try:
         with zipfile.ZipFile(path) as file:
-            return file.testzip() is None
+            return file.testzip() is None and (member is None or member in file.namelist())
     except (OSError, zipfile.BadZipFile):
         return False

@@ -67,7 +67,8 @@ class FakeMachine:
         header = "time/total_timesteps,time/iterations,time/time_elapsed"
         (run / "progress.csv").write_text(f"{header}\n{steps},1,2\n")
         with zipfile.ZipFile(run / f"rl_model_{steps}_steps.zip", "w") as file:
-            file.writestr("data", "x")
+            for member in ("data", "system_info.txt"):
+                file.writestr(member, "x")
 
     def trainings(self):
         return [arguments for arguments in self.started if arguments[0] == "sb3_uspl.train"]
@@ -156,6 +157,8 @@ def test_a_half_written_checkpoint_is_left_out(tmp_path, cells):
     folder = CellFolder(tmp_path / "logs", cell)
     whole, steps = folder.checkpoint()
     (whole.parent / f"rl_model_{steps + 1}_steps.zip").write_bytes(whole.read_bytes()[:-9])
+    with zipfile.ZipFile(whole.parent / f"rl_model_{steps + 2}_steps.zip", "w") as closed_too_early:
+        closed_too_early.writestr("data", "x")
     assert folder.checkpoint() == (whole, steps)
 
 
