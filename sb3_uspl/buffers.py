@@ -158,6 +158,11 @@ class EpisodeReplayBuffer:
         while self.nbytes > self.max_bytes:
             self.nbytes -= self.replay.popleft().nbytes
 
+    @property
+    def n_decisions(self) -> int:
+        """Decisions of the episodes that :meth:`batches` can draw."""
+        return sum(map(len, (*self._eligible_fresh(), *self.replay)))
+
     def batches(self, n_batches: int, n_tokens: int, device: th.device | str = "cpu") -> Generator[EpisodeBatch, None, None]:
         """
         Draw whole episodes, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one if the other is
@@ -187,10 +192,12 @@ class EpisodeReplayBuffer:
             for place, length in zip(all_places, all_lengths, strict=True):
                 yield EpisodeBatch({key: value[place] for key, value in staged.tokens.items()}, staged.truth[place], length)
 
-    def _choose(self, n_tokens: int) -> list[Episode]:
+    def _eligible_fresh(self) -> list[Episode]:
         only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
-        fresh = [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
-        sources = [source for source in (fresh, self.replay) if source]
+        return [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
+
+    def _choose(self, n_tokens: int) -> list[Episode]:
+        sources = [source for source in (self._eligible_fresh(), self.replay) if source]
         episodes: list[Episode] = []
         for source in sources:
             count = 0

@@ -107,7 +107,8 @@ class USPLPPO(PPO):
     :param encoder_learning_rate_floor: share of it that is left at the end of training, after half a cosine wave
     :param encoder_weight_decay: of the encoder (Tables 4 and 5)
     :param encoder_batch_size: decisions per encoder update, in whole episodes (Tables 4 and 5: 8000, 16000)
-    :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170)
+    :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170). A loaded model that goes on training begins
+        with an empty replay: until that suffices for as many, there is no more than one pass over it per rollout.
     :param encoder_max_grad_norm: gradient clipping of the encoder
     :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1 as it stands
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
@@ -256,6 +257,7 @@ class USPLPPO(PPO):
         self.context_length = context_length
         self._rollout_env: UncertaintyVecWrapper | None = None
         self._progress_period: tuple[int, int] | None = None
+        self._replay_is_lost = False
         if _init_setup_model:
             self._setup_model()
 
@@ -344,6 +346,8 @@ class USPLPPO(PPO):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         fresh = reset_num_timesteps or self._last_obs is None
+        if not len(self._episodes.replay):
+            self._replay_is_lost = not reset_num_timesteps and self.num_timesteps > 0
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._progress_period is None or reset_num_timesteps:
             warmup = int(0.2 * total_timesteps) if self.warmup_timesteps is None else self.warmup_timesteps
@@ -355,14 +359,18 @@ class USPLPPO(PPO):
             wrapper = self._make_rollout_env(self.env)
             self._rollout_env, fresh = wrapper, True
         if fresh:
-            assert self.rollout_buffer.episodes is not None
-            self.rollout_buffer.episodes.forget_running()
+            self._episodes.forget_running()
             self._last_obs = wrapper.begin(self._last_obs)
         return result
 
     def _make_rollout_env(self, env: VecEnv) -> UncertaintyVecWrapper:
         """What the experience is collected in; the baselines have others."""
         return UncertaintyVecWrapper(env, self.policy.encoder, self._uncertainty_config, self.seed)
+
+    @property
+    def _episodes(self) -> EpisodeReplayBuffer:
+        assert self.rollout_buffer.episodes is not None
+        return self.rollout_buffer.episodes
 
     @property
     def progress(self) -> float:
@@ -406,8 +414,8 @@ class USPLPPO(PPO):
 
     def train(self) -> None:
         """PPO's update, then the encoder's (Alg. 1, lines 12 and 13)."""
-        wrapper, episodes = self._rollout_env, self.rollout_buffer.episodes
-        assert wrapper is not None and episodes is not None
+        wrapper, episodes = self._rollout_env, self._episodes
+        assert wrapper is not None
         untrained = wrapper.progress == 0.0 and not self.policy_warmup
         if not untrained:
             super().train()
@@ -439,7 +447,7 @@ class USPLPPO(PPO):
         # A compiled function cannot be saved, but torch remembers what it has compiled: asking again is cheap.
         forward = th.compile(encoder.__call__, dynamic=True) if self.encoder_compile else encoder
         metrics = []
-        batches = episodes.batches(self.encoder_updates, self.encoder_batch_size, self.device)
+        batches = episodes.batches(self._count_encoder_updates(episodes), self.encoder_batch_size, self.device)
         for update, (tokens, truth, lengths) in enumerate(batches):
             if update == 0:
                 encoder.features.update_normalizers(tokens)
@@ -462,6 +470,14 @@ class USPLPPO(PPO):
             for name, value in zip(names, th.stack(metrics).mean(0).tolist(), strict=True):
                 if name != "accuracy" or encoder.discrete:
                     self.logger.record(f"encoder/{name}", value)
+
+    def _count_encoder_updates(self, episodes: EpisodeReplayBuffer) -> int:
+        """A model that was loaded knows more than the first few episodes of a new replay, which it would learn by heart."""
+        if not self._replay_is_lost:
+            return self.encoder_updates
+        one_pass = episodes.n_decisions // self.encoder_batch_size
+        self._replay_is_lost = one_pass < self.encoder_updates
+        return min(one_pass, self.encoder_updates)
 
     # -- saving ------------------------------------------------------------------------------------------------------------
 
