@@ -23,11 +23,12 @@ CIRCLE_X, CIRCLE_Y, CIRCLE_RADIUS, CIRCLE_CODE = range(4)
 RUNNING, SUCCESS, FAILURE = range(3)
 """Codes of how an episode stands."""
 
-RADIUS, MAX_YAW_RATE, YAW_GAIN, PERIOD, PRESSED = range(5)
+RADIUS, MAX_YAW_RATE, YAW_GAIN, YAW_ACCELERATION, PERIOD, PRESSED = range(6)
 """
-Entries of a body's array: radius (m), limit (rad/s) and gain (1/s) of the heading law, time of a substep (s), change of speed
-in a substep that counts as a collision (m/s).
+Entries of a body's array: radius (m), limit (rad/s) and gain (1/s) of the heading law, greatest change of the yaw rate
+(rad/s^2), time of a substep (s), change of speed in a substep that counts as a collision (m/s).
 """
+N_BODY = 6
 
 # How Bullet treats a contact, measured on its own cylinder at a wall (PyBullet 3.2.7): it sees one this much ahead, relative
 # to the radius of the smaller shape's bounding sphere; lets bodies sink in by so much; and takes that part of a deeper
@@ -177,9 +178,9 @@ def _blocked(
 
 
 @numba.njit(
-    "Tuple((float64, float64, float64, float64, float64, boolean, int64, int64, int64))"
+    "Tuple((float64, float64, float64, float64, float64, float64, boolean, int64, int64, int64))"
     f"({_SHAPES}, float64, {_CIRCLES}, float64, {_BODY}, "
-    "float64, float64, float64, float64, float64, float64, float64, int64)",
+    "float64, float64, float64, float64, float64, float64, float64, float64, int64)",
     cache=True,
 )
 def walk(
@@ -191,12 +192,13 @@ def walk(
     x: float,
     y: float,
     yaw: float,
+    yaw_rate: float,
     speed: float,
     target_yaw: float,
     bottom: float,
     top: float,
     n_substeps: int,
-) -> tuple[float, float, float, float, float, bool, int, int, int]:
+) -> tuple[float, float, float, float, float, float, bool, int, int, int]:
     """
     Walk at a speed and turn towards a heading until substeps or the episode are over; walls stop a body or let it slide.
 
@@ -204,34 +206,37 @@ def walk(
     :param lower_ground: m
     :param circles: that end the episode, ``(n, 4)``
     :param fall_height: a robot over ground lower than this has fallen, m; minus infinity: there are no falls
-    :param body: of the robot, ``(5,)``
+    :param body: of the robot, ``(N_BODY,)``
     :param x: m
     :param y: m
     :param yaw: rad
+    :param yaw_rate: in the substep before, rad/s
     :param speed: m/s
     :param target_yaw: rad, on the same continuous scale as ``yaw``
     :param bottom: height of the body's lower face, m
     :param top: height of the body's upper face, m
     :param n_substeps: at least 1
-    :return: x, y, yaw, mean velocity over the last substep (2 numbers), whether something pressed in it; number of substeps
-        done, number of those in which something pressed; code of how the episode stands
+    :return: x, y, yaw, yaw rate, mean velocity over the last substep (2 numbers), whether something pressed in it; number of
+        substeps done, number of those in which something pressed; code of how the episode stands
     """
     period, limit = body[PERIOD], body[MAX_YAW_RATE]
+    change = body[YAW_ACCELERATION] * period
     contacts = np.empty((shapes.shape[0], 4))
     vx, vy = 0.0, 0.0
     pressed = False
     done, n_pressed = 0, 0
     code = RUNNING
     while done < n_substeps and code == RUNNING:
-        rate = max(-limit, min(limit, body[YAW_GAIN] * (target_yaw - yaw)))
+        wanted = max(-limit, min(limit, body[YAW_GAIN] * (target_yaw - yaw)))
+        yaw_rate = max(yaw_rate - change, min(yaw_rate + change, wanted))
         # The mean heading of the substep makes an arc of chords of the right radius.
-        heading = yaw + 0.5 * rate * period
+        heading = yaw + 0.5 * yaw_rate * period
         motion = (x, y, speed * math.cos(heading), speed * math.sin(heading), bottom, top)
         vx, vy, pressed = _blocked(shapes, body, contacts, motion)
         x += vx * period
         y += vy * period
-        yaw += rate * period
+        yaw += yaw_rate * period
         done += 1
         n_pressed += pressed
         code = judge(circles, fall_height, shapes, lower_ground, x, y)
-    return x, y, yaw, vx, vy, pressed, done, n_pressed, code
+    return x, y, yaw, yaw_rate, vx, vy, pressed, done, n_pressed, code

@@ -84,7 +84,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--policy", choices=("deployment", "privileged", "both"), default="both")
     parser.add_argument(
         "--physics",
-        choices=("kinematic", "compiled", "full", "full_accurate"),
+        choices=("kinematic", "compiled", "varied", "full", "full_accurate"),
         help="fidelity of the robot; default: the environment's",
     )
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")

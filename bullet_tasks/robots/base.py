@@ -59,7 +59,8 @@ class Robot(ABC, Generic[CommandT]):
 
     def vary(self, rng: np.random.Generator) -> None:
         """
-        Draw what the pose of the next ``reset`` leaves open. Nothing, but for a robot on legs: its stride's phase.
+        Draw what the pose of the next ``reset`` leaves open. Nothing, but for a robot on legs (its stride's phase)
+        or with domain randomisation (its body).
 
         :param rng: the episode's random generator
         """

@@ -38,14 +38,28 @@ class CompiledQuadruped(LeglessQuadruped):
     def __init__(self, world: World) -> None:
         super().__init__()
         self._world = world
-        body = np.empty(5)
+        body = np.empty(kernels.N_BODY)
         body[kernels.RADIUS] = BODY_RADIUS
         body[kernels.MAX_YAW_RATE] = MAX_YAW_RATE
         body[kernels.YAW_GAIN] = YAW_GAIN
+        body[kernels.YAW_ACCELERATION] = np.inf
         body[kernels.PERIOD] = SUBSTEP
         body[kernels.PRESSED] = CONTACT_FORCE * SUBSTEP / MASS
         self._body = body
+        self._yaw_rate = 0.0
         self._appeared = False
+
+    def reset(self, x: float, y: float, ground: float, yaw: float) -> RobotState:
+        """
+        Put the robot somewhere, at rest (see base class).
+
+        :param x: m
+        :param y: m
+        :param ground: height of the floor there, m
+        :param yaw: rad
+        """
+        self._yaw_rate = 0.0
+        return super().reset(x, y, ground, yaw)
 
     def substep(self) -> RobotState:
         """Let 1/20 s pass (see base class)."""
@@ -66,7 +80,7 @@ class CompiledQuadruped(LeglessQuadruped):
     def _walk(self, circles: np.ndarray, fall_height: float, n_substeps: int) -> Stretch:
         x, y, z, yaw = self.state[:4]
         scene = self._world.scene
-        x, y, yaw, vx, vy, pressed, done, contacts, code = kernels.walk(
+        x, y, yaw, self._yaw_rate, vx, vy, pressed, done, contacts, code = kernels.walk(
             scene.packed,
             scene.lower_ground,
             circles,
@@ -75,6 +89,7 @@ class CompiledQuadruped(LeglessQuadruped):
             x,
             y,
             yaw,
+            self._yaw_rate,
             self._speed,
             self._target_yaw,
             z - HALF_TRUNK_HEIGHT,

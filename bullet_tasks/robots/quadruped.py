@@ -14,6 +14,7 @@ from bullet_tasks.robots.quadruped_body import (
     WALKING_SPEED,
     QuadrupedCommand,
 )
+from bullet_tasks.robots.varied_quadruped import Variation, VariedQuadruped
 from bullet_tasks.robots.walking_quadruped import ACCURATE, FAST, WalkingQuadruped
 from bullet_tasks.world import World
 
@@ -26,6 +27,8 @@ __all__ = [
     "CompiledQuadruped",
     "KinematicQuadruped",
     "QuadrupedCommand",
+    "Variation",
+    "VariedQuadruped",
     "WalkingQuadruped",
     "check_physics",
     "make_quadruped",
@@ -34,6 +37,7 @@ __all__ = [
 _PHYSICS: dict[str, Callable[[World], Robot[QuadrupedCommand]]] = {
     "kinematic": KinematicQuadruped,
     "compiled": CompiledQuadruped,
+    "varied": VariedQuadruped,
     "full": functools.partial(WalkingQuadruped, preset=FAST),
     "full_accurate": functools.partial(WalkingQuadruped, preset=ACCURATE),
 }
@@ -45,7 +49,8 @@ def make_quadruped(world: World, physics: str = "kinematic") -> Robot[QuadrupedC
 
     :param world: where
     :param physics: ``"kinematic"``: the body follows the command, collisions are PyBullet's; ``"compiled"``: the same model,
-        several times faster, without PyBullet; ``"full"``: it walks on its legs, with gravity and contacts;
+        several times faster, without PyBullet; ``"varied"``: that with another body in every episode (domain randomisation,
+        see :class:`Variation`); ``"full"``: it walks on its legs, with gravity and contacts;
         ``"full_accurate"``: the same with the A1 of ``pybullet_data`` and shorter steps, several times slower
     :raises ValueError: if the physics is unknown
     """
