@@ -10,12 +10,12 @@ import numba
 import numpy as np
 
 FOOTPRINT = np.array(
-    [(0.0, 0.0, 0.21), (0.183, 0.081, 0.034), (0.183, -0.081, 0.034), (-0.28, 0.11, 0.07), (-0.28, -0.11, 0.07)]
+    [(0.0, 0.0, 0.21), (0.183, 0.081, 0.050), (0.183, -0.081, 0.050), (-0.28, 0.11, 0.07), (-0.28, -0.11, 0.07)]
 )
 """
 Discs that stand for the robot, seen from above in the level frame: centre and radius, m. The first is nearly as wide as the
-body without legs, so that the robot keeps as far from walls beside it. Then shoulders, a centimetre less than they are, so
-that a robot told to walk on comes as near to a wall as that body; and the knees of the rear legs, which bend backwards.
+body without legs, so that the robot keeps as far from walls beside it. Then shoulders, half a centimetre more than they are,
+as one that rubs on a wall stops what should slide along it; and the knees of the rear legs, which bend backwards.
 """
 
 # Columns of a scene's array, as in ``bullet_tasks.kernels``.
@@ -24,15 +24,13 @@ _X, _Y, _COS, _SIN, _HALF_X, _HALF_Y, _BOTTOM, _TOP, _ROUND, _SOLID, _FLOOR = ra
 _LOW = 0.04  # m; what rises less above the ground is no wall
 _TALL = 0.35  # m above the ground; what hangs higher is passed under
 _NEAR = 0.75  # m from the trunk's centre; what is further away does not matter yet
+_JOINED = 1e-6  # m; walls that near are one
 _MOST = 64  # discs near walls that are reckoned with
 _SWEEPS = 6
 _STEP = 0.13  # m; floors that much lower are a drop
 _HALF_LENGTH = 0.12  # m ahead of and behind the trunk's centre, where drops are looked for
 _EDGE_SEEN, _EDGE_STEP = 0.2, 0.02  # m to either side, and how finely
 _EDGE_TIME, _EDGE_SPEED = 0.5, 0.2  # s, m/s
-_TOUCHING = 0.012  # m; a shoulder that near touches the wall
-_FACING = 0.95  # cosine of the angle between heading and wall; less is walked along
-_STRAIGHT, _SQUARING = 0.3, 3.0  # rad/s; 1/s
 _SLOW_TURN, _FAST_TURN = 0.8, 2.0  # rad/s; slower turns need no room, and faster ones no more
 
 _TABLE = "float64[:, ::1]"
@@ -117,8 +115,33 @@ def off_edges(shapes: np.ndarray, lower_ground: float, pose: tuple[float, float,
     return max(-_EDGE_SPEED, min(_EDGE_SPEED, total))
 
 
+@numba.njit(f"boolean({_TABLE}, int64, float64)", cache=True)
+def _is_wall(shapes: np.ndarray, i: int, ground: float) -> bool:
+    if shapes[i, _SOLID] == 0.0 or shapes[i, _FLOOR] != 0.0:
+        return False
+    return shapes[i, _TOP] >= ground + _LOW and shapes[i, _BOTTOM] <= ground + _TALL
+
+
+@numba.njit(f"boolean({_TABLE}, float64, int64, float64, float64)", cache=True, error_model="numpy")
+def _hidden(shapes: np.ndarray, ground: float, i: int, x: float, y: float) -> bool:
+    """
+    Whether the point of a wall that is nearest to another point is part of another wall, which is nearer.
+
+    Where two walls meet in line, the corner of the one ahead would else stop what slides along the other.
+    """
+    gap, away_x, away_y = clearance(shapes, i, x, y)
+    nearest_x, nearest_y = x - gap * away_x, y - gap * away_y
+    for j in range(shapes.shape[0]):
+        if j == i or not _is_wall(shapes, j, ground) or clearance(shapes, j, nearest_x, nearest_y)[0] > _JOINED:
+            continue
+        other = clearance(shapes, j, x, y)[0]
+        if other < gap - _JOINED or (j < i and other <= gap + _JOINED):
+            return True
+    return False
+
+
 @numba.njit(
-    f"{_THREE}({_TABLE}, float64, {_TABLE}, {_THREE}, float64, {_TWO}, {_THREE})",
+    f"{_TWO}({_TABLE}, float64, {_TABLE}, {_THREE}, float64, {_TWO}, {_THREE})",
     cache=True,
     error_model="numpy",
 )
@@ -130,13 +153,11 @@ def give_way(
     ground: float,
     motion: tuple[float, float],
     limits: tuple[float, float, float],
-) -> tuple[float, float, float]:
+) -> tuple[float, float]:
     """
     Velocity that keeps a robot off walls and drops beside it, as near as possible to the one that it is told.
 
     No disc of the footprint may approach a wall faster than its distance in ``wall_time``; one that is too near is moved away.
-    A robot that is told to walk straight on into a wall, and nearly faces it, is turned square to it: only so is its centre as
-    near to the wall as that of a round body.
 
     :param shapes: a scene, ``(n, bullet_tasks.kernels.N_COLUMNS)``
     :param lower_ground: height of the ground beside all floors, m
@@ -146,7 +167,7 @@ def give_way(
     :param motion: commanded speed ahead (m/s) and yaw rate (rad/s)
     :param limits: ``wall_time`` (s), greatest speed out of a wall's way (m/s), and how much further off the robot is to be for
         every rad/s that it turns faster than slowly (m)
-    :return: speed ahead and to the left (m/s), yaw rate (rad/s)
+    :return: speed ahead and to the left, m/s
     """
     x, y, yaw = pose
     speed, rate = motion
@@ -156,13 +177,8 @@ def give_way(
     # One row each: direction away from the wall, in the level frame, and least speed along it.
     walls = np.empty((_MOST, 3))
     n = 0
-    squaring = 0.0
     for i in range(shapes.shape[0]):
-        if shapes[i, _SOLID] == 0.0 or shapes[i, _FLOOR] != 0.0:
-            continue
-        if shapes[i, _TOP] < ground + _LOW or shapes[i, _BOTTOM] > ground + _TALL:
-            continue
-        if clearance(shapes, i, x, y)[0] > _NEAR:
+        if not _is_wall(shapes, i, ground) or clearance(shapes, i, x, y)[0] > _NEAR:
             continue
         for k in range(footprint.shape[0]):
             ahead, left = footprint[k, 0], footprint[k, 1]
@@ -171,9 +187,9 @@ def give_way(
             least = min(most, -gap / wall_time)
             if least < -most - abs(speed) or n == _MOST:
                 continue
+            if _hidden(shapes, ground, i, x + c * ahead - s * left, y + s * ahead + c * left):
+                continue
             away_ahead, away_left = c * away_x + s * away_y, c * away_y - s * away_x
-            if gap < _TOUCHING and ahead > 0.0 and -away_ahead > _FACING and speed > 0.0 and abs(rate) < _STRAIGHT:
-                squaring = -_SQUARING * away_left
             # What the turn does to the disc is not left to the trunk's velocity.
             walls[n, 0], walls[n, 1] = away_ahead, away_left
             walls[n, 2] = least - rate * (ahead * away_left - left * away_ahead)
@@ -186,4 +202,4 @@ def give_way(
                 ahead += lacking * walls[k, 0]
                 left += lacking * walls[k, 1]
     ahead = max(min(speed, -most), min(max(speed, most), ahead))
-    return ahead, max(-most, min(most, left)), rate + squaring
+    return ahead, max(-most, min(most, left))

@@ -220,7 +220,7 @@ class WalkingQuadruped(Robot[QuadrupedCommand]):
         for _ in range(self._steps):
             rate = self._turn(yaw)
             x, y, z = measured[: gait.TRUNK_Z + 1].tolist()
-            ahead, left, rate = give_way(
+            ahead, left = give_way(
                 scene.packed,
                 scene.lower_ground,
                 FOOTPRINT,
