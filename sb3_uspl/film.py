@@ -282,7 +282,8 @@ class _Stage:
             self._draw_map(axes["map"], clip.goal)
         if clip.views:
             inset = axes[shown[0] if shown else "bars"].inset_axes(_CAMERA_INSET, xticks=[], yticks=[])
-            inset.set_title("its camera", fontsize="x-small", pad=2.0)
+            label = dict(boxstyle="square,pad=0.2", facecolor="white", edgecolor="none", alpha=0.8)
+            inset.text(0.04, 0.94, "its camera", transform=inset.transAxes, va="top", fontsize="x-small", bbox=label)
             self.view = inset.imshow(clip.views[0], cmap="gray", vmin=0, vmax=255)
         self._draw_time(axes["time"], limits)
         self._draw_bars(axes["bars"])
