@@ -55,6 +55,8 @@ TASKS = (
     # A repetition lasts as long as one of its episodes.
     Task("ActiveTMaze-v0", {}, 32),
 )
+IMAGE_TASKS = (Task("SignpostNavDepth-v0", {"physics": "compiled"}),)
+"""Broken down by phase only: minutes an iteration in methods that keep images in PPO's buffers."""
 RECURRENT_TARGET, RMA_TARGET, ROLLOUT_TARGET, SPEED_TARGET = 10.0, 1.1, 1.5, 10_000.0
 """USPL's samples/s over RecurrentPPO's; its iteration over RMA's; its rollout over PPO's, in time; decisions/s end to end."""
 ALL_AT_ONCE: Settings = dict(warmup_timesteps=0, ramp_timesteps=1, target_kl=None, seed=0, device="cpu")
@@ -67,6 +69,7 @@ QUICK: dict[str, Any] = dict(
     repetitions=1,
     tasks=(Task("LateralChoice-v0", {"physics": "compiled"}, 32),),
     decisions=512,
+    image_tasks=(),
     rollout_envs=8,
     env_counts=(32, 64),
     thread_counts=(1,),
@@ -255,6 +258,7 @@ def end_to_end(
 def run(
     repetitions: int = 5,
     tasks: Sequence[Task] = TASKS,
+    image_tasks: Sequence[Task] = IMAGE_TASKS,
     decisions: int | None = None,
     rollout_envs: int = 128,
     env_counts: Sequence[int] = (128, 256),
@@ -266,6 +270,7 @@ def run(
 
     :param repetitions: rounds of every comparison
     :param tasks: to learn; the first is the one for :func:`end_to_end`
+    :param image_tasks: further ones, broken down by phase only
     :param decisions: of an iteration, in all environments; None takes the zoo's
     :param rollout_envs: number of environments for :func:`compare_rollouts`
     :param env_counts: numbers of environments for :func:`end_to_end`
@@ -289,6 +294,8 @@ def run(
         rollouts += rows(values, f"{task}, {rollout_envs} envs", "s / rollout", "PPO")
         measured = ratio(values, "USPLPPO", "PPO")
         targets.append(target(f"{task}: time of a rollout, USPL / PPO", measured, at_most=ROLLOUT_TARGET))
+    for task in image_tasks:
+        phases += breakdown(task, decisions, threads, repetitions)
     values = end_to_end(tasks[0], env_counts, thread_counts, decisions, repetitions)
     best = max(statistics.median(measured) for measured in values.values())
     targets.append(target(f"{tasks[0]}: decisions/s end to end, the best of these", best, SPEED_TARGET))
