@@ -25,7 +25,8 @@ class Variation:
     :param yaw_acceleration: greatest change of the yaw rate, rad/s^2
     :param speed: relative to the commanded one
     :param heading_error: greatest error of a command's heading either way, drawn for every command, rad
-    :raises ValueError: if a range is empty or not positive, or the error negative
+    :param pitch_error: the same of the body pitch, which cameras follow, rad
+    :raises ValueError: if a range is empty or not positive, or an error negative
     """
 
     radius: _Range = (0.20, 0.25)
@@ -34,11 +35,14 @@ class Variation:
     yaw_acceleration: _Range = (10.0, 60.0)
     speed: _Range = (0.95, 1.05)
     heading_error: float = 0.1
+    pitch_error: float = 0.02
 
     def __post_init__(self) -> None:
         ranges = dataclasses.asdict(self)
-        if not ranges.pop("heading_error") >= 0.0:
-            raise ValueError(f"`heading_error` must be 0 or more rad, got {self.heading_error}.")
+        for name in ("heading_error", "pitch_error"):
+            error = ranges.pop(name)
+            if not error >= 0.0:
+                raise ValueError(f"`{name}` must be 0 or more rad, got {error}.")
         for name, (least, greatest) in ranges.items():
             if not 0.0 < least <= greatest:
                 raise ValueError(f"`{name}` must be a range of positive numbers, (least, greatest), got {(least, greatest)}.")
@@ -77,6 +81,7 @@ class VariedQuadruped(CompiledQuadruped):
 
         :param command: speed (m/s), heading and body pitch (rad)
         """
-        error = self.variation.heading_error
-        off = float(self._rng.uniform(-error, error))
-        super().command(command._replace(speed=self._pace * command.speed, target_yaw=command.target_yaw + off))
+        v = self.variation
+        yaw = command.target_yaw + self._rng.uniform(-v.heading_error, v.heading_error)
+        pitch = command.pitch + self._rng.uniform(-v.pitch_error, v.pitch_error)
+        super().command(QuadrupedCommand(self._pace * command.speed, yaw, pitch))

@@ -30,6 +30,7 @@ NONE = Variation(
     yaw_acceleration=(1e9,) * 2,
     speed=(1.0, 1.0),
     heading_error=0.0,
+    pitch_error=0.0,
 )
 
 
@@ -48,7 +49,7 @@ def walk(robot, seed=0):
     for _ in range(40):
         robot.command(QuadrupedCommand(WALKING_SPEED, robot.state.yaw + rng.uniform(-1.0, 1.0)))
         states += [robot.substep() for _ in range(5)]
-    return np.array([state[:6] for state in states])
+    return np.array([(*state[:6], state.pitch) for state in states])
 
 
 def test_without_variation_it_is_the_compiled_body_bit_for_bit(world):
@@ -83,16 +84,17 @@ def test_turns_set_in_and_end_no_faster_than_the_acceleration_allows(world):
 
 
 @pytest.mark.parametrize("error", [0.0, 0.2])
-def test_headings_are_off_by_no_more_than_the_error(world, error):
-    robot = VariedQuadruped(world, Variation(heading_error=error))
+@pytest.mark.parametrize("name", ["heading_error", "pitch_error"])
+def test_commands_are_off_by_no_more_than_the_error(world, name, error):
+    robot = VariedQuadruped(world, Variation(**{name: error}))
     robot.vary(np.random.default_rng(0))
     reached = []
     for _ in range(30):
         robot.reset(-2.0, 0.0, 0.0, 0.0)
-        robot.command(QuadrupedCommand(0.0, 0.5))
+        robot.command(QuadrupedCommand(0.0, 0.5, 0.1))
         for _ in range(60):
             robot.substep()
-        reached.append(robot.state.yaw - 0.5)
+        reached.append(robot.state.yaw - 0.5 if name == "heading_error" else robot.state.pitch - 0.1)
     assert np.abs(reached).max() <= error + 1e-3
     assert np.std(reached) == pytest.approx(error / math.sqrt(3.0), rel=0.3, abs=1e-3)
 
@@ -115,6 +117,7 @@ def test_tasks_are_the_same_with_it():
         (dict(radius=(0.25, 0.2)), "`radius` must be a range of positive numbers"),
         (dict(speed=(0.0, 1.0)), "`speed` must be a range of positive numbers"),
         (dict(heading_error=-0.1), "`heading_error` must be 0 or more"),
+        (dict(pitch_error=-0.1), "`pitch_error` must be 0 or more"),
     ],
 )
 def test_impossible_variations_are_refused(arguments, words):
