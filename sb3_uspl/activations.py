@@ -44,6 +44,9 @@ class RecoverableTanh(nn.Module):
       3 M decisions. It learned nothing more from data from which a new encoder learned within 300 updates; with this gradient,
       the same saturated encoder did so, too. Image features of Signpost Nav with depth images: inputs of +-77 after
       0.8 M decisions, +-750 after 0.9 M with twice the learning rate.)
+
+    It is not the gradient of the result where that is far from 0. An encoder that was trained with plain tanh, and whose
+    embedding is saturated, is torn down by it (see "Training on, with legs" in ``docs/full_physics.md``).
     """
 
     def forward(self, x: th.Tensor) -> th.Tensor:
