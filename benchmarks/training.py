@@ -258,24 +258,24 @@ def end_to_end(
 def run(
     repetitions: int = 5,
     tasks: Sequence[Task] = TASKS,
-    image_tasks: Sequence[Task] = IMAGE_TASKS,
     decisions: int | None = None,
     rollout_envs: int = 128,
     env_counts: Sequence[int] = (128, 256),
     thread_counts: Sequence[int] = (1, 2),
     threads: int = 1,
+    image_tasks: Sequence[Task] = IMAGE_TASKS,
 ) -> Tables:
     """
     The whole section.
 
     :param repetitions: rounds of every comparison
     :param tasks: to learn; the first is the one for :func:`end_to_end`
-    :param image_tasks: further ones, broken down by phase only
     :param decisions: of an iteration, in all environments; None takes the zoo's
     :param rollout_envs: number of environments for :func:`compare_rollouts`
     :param env_counts: numbers of environments for :func:`end_to_end`
     :param thread_counts: threads of torch for :func:`end_to_end`
     :param threads: of torch for everything else
+    :param image_tasks: further tasks, broken down by phase only
     """
     methods: list[Row] = []
     phases: list[Row] = []

@@ -241,12 +241,16 @@ def test_encoder():
 def test_training(monkeypatch):
     short = dict(n_epochs=1, batch_size=320, encoder_updates=1, encoder_batch_size=64)
     monkeypatch.setattr(training, "ALL_AT_ONCE", {**training.ALL_AT_ONCE, **short})
-    tables = training.run(1, [LATERAL_CHOICE], ONE_EPISODE, rollout_envs=8, env_counts=(8,), thread_counts=(1,))
+    seeing = [training.Task("SignpostNavDepth-v0", {"physics": "compiled"}, 8)]
+    quick = dict(rollout_envs=8, env_counts=(8,), thread_counts=(1,))
+    tables = training.run(1, [LATERAL_CHOICE], ONE_EPISODE, **quick, image_tasks=seeing)
     speed, by_phase, rollouts, whole, targets = tables.values()
     check_table(speed, "samples / s")
     assert {row["contender"] for row in speed} == set(METHODS)
-    assert [row["phase"] for row in by_phase] == list(phases.PHASES)
-    assert sum(row["share"] for row in by_phase) == pytest.approx(1.0)
+    assert [row["phase"] for row in by_phase] == 2 * list(phases.PHASES)
+    for task in (LATERAL_CHOICE, *seeing):
+        shares = [row["share"] for row in by_phase if row["what"] == f"{task}, {task.n_envs} envs"]
+        assert len(shares) == len(phases.PHASES) and sum(shares) == pytest.approx(1.0)
     check_table(rollouts, "s / rollout")
     check_table(whole, "decisions / s")
     assert len(targets) == 4
