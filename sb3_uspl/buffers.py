@@ -108,6 +108,8 @@ class EpisodeReplayBuffer:
         self.replay: deque[Episode] = deque()
         self.fresh: list[Episode] = []
         self.nbytes = 0
+        self.full = False
+        """Whether older episodes have had to make room for newer ones."""
         self.forget_running()
 
     def forget_running(self) -> None:
@@ -155,6 +157,7 @@ class EpisodeReplayBuffer:
                 self.replay.append(episode)
                 self.nbytes += episode.nbytes
         self.fresh = []
+        self.full = self.full or self.nbytes > self.max_bytes
         while self.nbytes > self.max_bytes:
             self.nbytes -= self.replay.popleft().nbytes
 

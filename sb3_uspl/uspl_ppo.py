@@ -108,7 +108,7 @@ class USPLPPO(PPO):
     :param encoder_weight_decay: of the encoder (Tables 4 and 5)
     :param encoder_batch_size: decisions per encoder update, in whole episodes (Tables 4 and 5: 8000, 16000)
     :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170). A loaded model that goes on training begins
-        with an empty replay: until that suffices for as many, there is no more than one pass over it per rollout.
+        with an empty replay: until that suffices for as many or is full, there is no more than one pass over it per rollout.
     :param encoder_max_grad_norm: gradient clipping of the encoder
     :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1 as it stands
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
@@ -476,7 +476,7 @@ class USPLPPO(PPO):
         if not self._replay_is_lost:
             return self.encoder_updates
         one_pass = episodes.n_decisions // self.encoder_batch_size
-        self._replay_is_lost = one_pass < self.encoder_updates
+        self._replay_is_lost = one_pass < self.encoder_updates and not episodes.full
         return min(one_pass, self.encoder_updates)
 
     # -- saving ------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A shipped agent, trained without legs, is trained on with them."""
+"""Training on: from a model that was saved, and from a shipped agent without legs to one with them."""
 
 import csv
 
@@ -7,7 +7,9 @@ import yaml
 
 from sb3_uspl import USPLPPO
 from sb3_uspl._zoo import TRAINED_AGENTS
+from sb3_uspl.buffers import EpisodeReplayBuffer
 from tests.sb3_uspl.commands import run
+from tests.sb3_uspl.test_uspl_ppo import make_model, make_venv
 
 ENV = "LateralChoice-v0"
 SHIPPED = TRAINED_AGENTS / "uspl_ppo" / f"{ENV}_1" / f"{ENV}.zip"
@@ -32,3 +34,31 @@ def test_a_shipped_agent_is_trained_on_in_full_physics(tmp_path):
     with open(folder / "progress.csv") as file:
         steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(file) if row["time/total_timesteps"]]
     assert steps[0] > before.num_timesteps
+
+
+def test_a_loaded_encoder_is_not_fitted_to_the_first_few_episodes_of_a_new_replay(tmp_path, monkeypatch):
+    asked = []
+    draw = EpisodeReplayBuffer.batches
+
+    def count(self, n_batches, n_tokens, device="cpu"):
+        asked.append((n_batches, self.n_decisions // n_tokens))
+        return draw(self, n_batches, n_tokens, device)
+
+    monkeypatch.setattr(EpisodeReplayBuffer, "batches", count)
+    model = make_model(encoder_batch_size=64, encoder_updates=3, replay="all")
+    model.learn(8 * 16 * 2)
+    model.learn(8 * 16 * 2, reset_num_timesteps=False)
+    assert [n_batches for n_batches, _ in asked] == [3] * 4, "a model's own replay is there"
+    model.save(tmp_path / "model")
+    asked.clear()
+    loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8), encoder_batch_size=96)
+    loaded.learn(8 * 16 * 6, reset_num_timesteps=False)
+    assert [n_batches for n_batches, _ in asked] == [min(3, one_pass) for _, one_pass in asked]
+    assert asked[0][0] < 3 == asked[-1][0]
+    asked.clear()
+    full = USPLPPO.load(tmp_path / "model", env=make_venv(8), encoder_batch_size=10_000, replay_bytes=4_000)
+    full.learn(8 * 16 * 6, reset_num_timesteps=False)
+    assert asked[0][0] == 0 and asked[-1][0] == 3, "a replay that is full holds all that it ever will"
+    asked.clear()
+    USPLPPO.load(tmp_path / "model", env=make_venv(8)).learn(8 * 16)
+    assert asked[0][0] == 3, "a training that begins anew is like any other"

@@ -13,7 +13,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_uspl import RMA, USPLPPO, MlpPolicy
-from sb3_uspl.buffers import EpisodeReplayBuffer
 from tests.sb3_uspl.toy import IMAGE, ToyEnv
 
 FAST = dict(n_steps=16, batch_size=32, n_epochs=2, encoder_updates=2, encoder_batch_size=64, seed=0)
@@ -355,30 +354,6 @@ def test_training_goes_on_after_a_callback_stopped_it():
     model = make_model()
     model.learn(10_000, callback=Stop())
     model.learn(512, reset_num_timesteps=False)
-
-
-def test_a_loaded_encoder_is_not_fitted_to_the_first_few_episodes_of_a_new_replay(tmp_path, monkeypatch):
-    asked = []
-    draw = EpisodeReplayBuffer.batches
-
-    def count(self, n_batches, n_tokens, device="cpu"):
-        asked.append((n_batches, self.n_decisions // n_tokens))
-        return draw(self, n_batches, n_tokens, device)
-
-    monkeypatch.setattr(EpisodeReplayBuffer, "batches", count)
-    model = make_model(encoder_batch_size=64, encoder_updates=3, replay="all")
-    model.learn(8 * 16 * 2)
-    model.learn(8 * 16 * 2, reset_num_timesteps=False)
-    assert [n_batches for n_batches, _ in asked] == [3] * 4, "a model's own replay is there"
-    model.save(tmp_path / "model")
-    asked.clear()
-    loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8), encoder_batch_size=96)
-    loaded.learn(8 * 16 * 6, reset_num_timesteps=False)
-    assert [n_batches for n_batches, _ in asked] == [min(3, one_pass) for _, one_pass in asked]
-    assert asked[0][0] < 3 == asked[-1][0]
-    asked.clear()
-    USPLPPO.load(tmp_path / "model", env=make_venv(8)).learn(8 * 16)
-    assert asked[0][0] == 3, "a training that begins anew is like any other"
 
 
 @pytest.mark.parametrize("length", [5, 8])
