@@ -160,7 +160,8 @@ class ImageCNN(nn.Module):
             layers.append(nn.ELU())
             height, width = (((size - kernel) // stride + 1) // pooling for size in (height, width))
             n_channels = channels
-        self.convolutions = nn.Sequential(*layers, nn.Flatten())
+        # Channels last: oneDNN's convolutions take two thirds of the time that way round, see `make benchmark`.
+        self.convolutions = nn.Sequential(*layers).to(memory_format=th.channels_last)  # type: ignore[call-overload]
         self.fully_connected = mlp(n_channels * height * width, fully_connected)
         self.fully_connected[-1] = RecoverableTanh()
         self.width = fully_connected[-1]
@@ -172,7 +173,9 @@ class ImageCNN(nn.Module):
         :param images: ``(n, channels, height, width)``, in the dtype of the space
         :return: ``(n, width)``
         """
-        return self.fully_connected(self.convolutions((images.float() - self.low) / self.range - 0.5))
+        pixels = images.to(th.float32, copy=True, memory_format=th.channels_last)
+        pixels.mul_(1.0 / self.range).sub_(self.low / self.range + 0.5)  # in place: the largest tensor that there is
+        return self.fully_connected(self.convolutions(pixels).permute(0, 2, 3, 1).flatten(1))
 
 
 def _least_size(convolutions: Convolutions) -> int:

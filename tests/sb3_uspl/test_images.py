@@ -1,5 +1,7 @@
 """Images as targets: seen by the encoder alone, stored once in their own dtype, never normalised by anybody else."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -61,7 +63,20 @@ def test_the_papers_cnn_hand_counted():
     expected = [(32, 1, 5, 5), (32,), (64, 32, 3, 3), (64,), (128, 64 * 25 * 39), (128,), (128, 128), (128,)]
     assert shapes == expected
     kinds = [type(layer).__name__ for layer in (*cnn.convolutions, *cnn.fully_connected)]
-    assert kinds == ["Conv2d", "MaxPool2d", "ELU", "Conv2d", "ELU", "Flatten", "Linear", "ELU", "Linear", "RecoverableTanh"]
+    assert kinds == ["Conv2d", "MaxPool2d", "ELU", "Conv2d", "ELU", "Linear", "ELU", "Linear", "RecoverableTanh"]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float16])
+def test_the_fast_layout_changes_nothing(dtype):
+    cnn = ImageCNN(spaces.Box(0, 255 if dtype is np.uint8 else 1, (3, 36, 48), dtype), SMALL, (64,))
+    images = th.as_tensor(np.random.default_rng(0).integers(0, 2, (5, 3, 36, 48)).astype(dtype))
+    given = images.clone()
+    features = cnn(images)
+    plain = copy.deepcopy(cnn).to(memory_format=th.contiguous_format)
+    pixels = plain.convolutions((images.float() - cnn.low) / cnn.range - 0.5)
+    expected = plain.fully_connected(pixels.permute(0, 2, 3, 1).flatten(1))
+    th.testing.assert_close(features, expected, rtol=1e-4, atol=1e-5)
+    assert th.equal(images, given)
 
 
 def test_saturated_image_features_learn_on():
