@@ -62,3 +62,12 @@ def test_a_loaded_encoder_is_not_fitted_to_the_first_few_episodes_of_a_new_repla
     asked.clear()
     USPLPPO.load(tmp_path / "model", env=make_venv(8)).learn(8 * 16)
     assert asked[0][0] == 3, "a training that begins anew is like any other"
+
+
+def test_a_policy_that_started_anew_after_the_warm_up_does_not_do_so_again(tmp_path):
+    model = make_model(policy_restart=True, warmup_timesteps=8 * 16, ramp_timesteps=0)
+    model.learn(8 * 16 * 3)
+    model.save(tmp_path / "model")
+    loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8), learning_rate=0.0)
+    loaded.learn(8 * 16 * 2, reset_num_timesteps=False)
+    assert (loaded.policy.action_net.weight == model.policy.action_net.weight).all()
