@@ -357,6 +357,7 @@ class USPLPPO(PPO):
         wrapper = self._rollout_env
         if wrapper is None or wrapper.venv is not self.env or wrapper.encoder is not self.policy.encoder:
             wrapper = self._make_rollout_env(self.env)
+            wrapper.progress = self.progress  # a training that goes on is not at the end of its warm-up, see `policy_restart`
             self._rollout_env, fresh = wrapper, True
         if fresh:
             self._episodes.forget_running()
