@@ -28,6 +28,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         fourier_inputs=None,
         normalize=True,
         extremes=True,
+        scan=False,
         orthogonal=False,
         categorical=False,
         memory_kwargs={},
@@ -45,6 +46,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         fourier_inputs=None,
         normalize=True,
         extremes=False,
+        scan=False,
         orthogonal=False,
         categorical=False,
         memory_kwargs={"transformer": {"n_heads": 16, "head_width": 64}},
@@ -55,9 +57,9 @@ Sizes of the encoder: ``hidden`` layers for the common observation and for a vec
 common observation if the target is an image (None: ``hidden``), the image's ``convolutions`` and ``image_layers`` (see
 ``ImageCNN``), the ``trunk`` before the memory, the ``embedding`` after it, the ``head`` of mean and standard deviation,
 ``frequencies`` of the Fourier features and ``fourier_inputs`` that have them, whether to ``normalize`` the common observation,
-``extremes`` of a vector target as inputs (all see ``TokenFeatures``), whether linear layers start ``orthogonal``
-(gain sqrt(2), no bias) instead of in torch's way, which halves the signal in each, whether the belief about discrete
-dimensions is ``categorical`` (see ``DiscreteHead``), and ``memory_kwargs`` by the memory's name.
+``extremes`` of a vector target and the ``scan`` of an image as inputs (all see ``TokenFeatures``), whether linear layers start
+``orthogonal`` (gain sqrt(2), no bias) instead of in torch's way, which halves the signal in each, whether the belief about
+discrete dimensions is ``categorical`` (see ``DiscreteHead``), and ``memory_kwargs`` by the memory's name.
 """
 
 IMAGE_TOKENS = 2048
@@ -209,6 +211,7 @@ class ObservationEncoder(nn.Module):
             sizes["convolutions"],
             sizes["image_layers"],
             sizes["extremes"],
+            sizes["scan"],
             sizes["fourier_inputs"],
             sizes["normalize"],
         )

@@ -125,6 +125,17 @@ Convolutions = Sequence[tuple[int, int, int, int]]
 """Channels, kernel, stride and max-pooling (1: none) of each layer."""
 
 
+def column_scan(pixels: th.Tensor) -> th.Tensor:
+    """
+    What a laser scanner would make of depth images: of every column the least value, the mean, and the share of pixels that
+    show anything in reach, as they are less than the greatest. How near and how high something stands is in these.
+
+    :param pixels: ``(n, channels, height, width)``, in [-0.5, 0.5]
+    :return: ``(n, 3 * channels * width)``
+    """
+    return th.cat((pixels.amin(2), pixels.mean(2), (pixels < 0.499).float().mean(2)), dim=-1).flatten(1)
+
+
 class ImageCNN(nn.Module):
     """
     Image features: convolutions and fully connected layers with ELU between them, Tanh at the end (App. C.3.3), one that
@@ -135,10 +146,13 @@ class ImageCNN(nn.Module):
     :param space: image space ``(channels, height, width)``, uint8 or float16
     :param convolutions: see ``Convolutions``
     :param fully_connected: width of each layer, at least one
+    :param scan: layers of an MLP over the images' :func:`column_scan`, beside the convolutions; empty: there is none
     :raises ValueError: if a layer is impossible, or the images are too small for the convolutions
     """
 
-    def __init__(self, space: spaces.Box, convolutions: Convolutions, fully_connected: Sequence[int]):
+    def __init__(
+        self, space: spaces.Box, convolutions: Convolutions, fully_connected: Sequence[int], scan: Sequence[int] = ()
+    ):
         super().__init__()
         if not fully_connected or not all(len(layer) == 4 and min(layer) >= 1 for layer in convolutions):
             raise ValueError(
@@ -146,6 +160,7 @@ class ImageCNN(nn.Module):
                 "stride, max-pooling), at least 1 each, and there must be at least one fully connected layer."
             )
         n_channels, height, width = space.shape
+        self.scan = mlp(3 * n_channels * width, scan) if scan else None
         least = _least_size(convolutions)
         if min(height, width) < least:
             raise ValueError(
@@ -164,7 +179,7 @@ class ImageCNN(nn.Module):
         self.convolutions = nn.Sequential(*layers).to(memory_format=th.channels_last)  # type: ignore[call-overload]
         self.fully_connected = mlp(n_channels * height * width, fully_connected)
         self.fully_connected[-1] = RecoverableTanh()
-        self.width = fully_connected[-1]
+        self.width = fully_connected[-1] + (scan[-1] if scan else 0)
         """Number of features."""
         self.low, self.range = float(space.low.min()), float(space.high.max()) - float(space.low.min())
 
@@ -175,7 +190,8 @@ class ImageCNN(nn.Module):
         """
         pixels = images.to(th.float32, copy=True, memory_format=th.channels_last)
         pixels.mul_(1.0 / self.range).sub_(self.low / self.range + 0.5)  # in place: the largest tensor that there is
-        return self.fully_connected(self.convolutions(pixels).permute(0, 2, 3, 1).flatten(1))
+        features = self.fully_connected(self.convolutions(pixels).permute(0, 2, 3, 1).flatten(1))
+        return features if self.scan is None else th.cat((features, self.scan(column_scan(pixels))), dim=1)
 
 
 def _least_size(convolutions: Convolutions) -> int:
@@ -199,6 +215,7 @@ class TokenFeatures(nn.Module):
     :param image_layers: its fully connected layers
     :param extremes: whether a vector target's least and greatest value are inputs of their own beside the common
         observation: of scandots, how high the highest thing in sight is, which an MLP over all points takes long to find
+    :param scan: whether an image's :func:`column_scan` has an MLP of its own beside the CNN
     :param fourier_inputs: indices of the common observation's numbers that have Fourier features; None: all, and the action
     :param normalize: whether the common observation and the action are brought to zero mean and unit variance. Where little
         of what varies matters, as a few centimetres of jitter beside a reading, their own scale tells the encoder more.
@@ -215,6 +232,7 @@ class TokenFeatures(nn.Module):
         convolutions: Convolutions = (),
         image_layers: Sequence[int] = (128, 128),
         extremes: bool = False,
+        scan: bool = False,
         fourier_inputs: Sequence[int] | None = None,
         normalize: bool = True,
     ):
@@ -235,7 +253,7 @@ class TokenFeatures(nn.Module):
         width = hidden[-1]
         if self.has_image:
             assert isinstance(target, spaces.Box)
-            self.image = ImageCNN(target, convolutions, image_layers)
+            self.image = ImageCNN(target, convolutions, image_layers, hidden if scan else ())
             width += self.image.width
         if self.has_vector_target:
             assert isinstance(target, spaces.Box)

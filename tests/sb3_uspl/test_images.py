@@ -106,11 +106,27 @@ def test_numbers_reach_the_cnn_within_one_unit(image):
     assert (seen[0][0] == -0.5).all() and (seen[0][1] == 0.5).all() and seen[0].dtype == th.float32
 
 
-@pytest.mark.parametrize("preset", ["small", "paper"])
+@IMAGES
+def test_a_column_scan_hand_counted(image):
+    cnn = ImageCNN(image, SMALL, (64,), scan=(8,))
+    seen = []
+    cnn.scan.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    picture = image.high.copy()
+    middle = 0.5 * (image.low[0, 0, 0] + image.high[0, 0, 0])
+    picture[0, 9:, 3] = middle  # three quarters of the fourth column
+    assert cnn(th.as_tensor(picture[None])).shape == (1, cnn.width) == (1, 64 + 8)
+    least, mean, share = seen[0].view(3, 48)
+    one_unit = 1.0 / 255.0
+    assert abs(least[3]) <= one_unit and abs(mean[3] - 0.125) <= one_unit and share[3] == 0.75
+    others = th.arange(48) != 3
+    assert (least[others] > 0.499).all() and (mean[others] > 0.499).all() and (share[others] == 0.0).all()
+
+
+@pytest.mark.parametrize("preset, scan", [("small", False), ("small", True), ("paper", False)])
 @pytest.mark.parametrize("memory", MEMORIES)
 @IMAGES
-def test_steps_equal_whole_episodes(preset, memory, image):
-    encoder, lengths = make_encoder(image, preset, memory), [5, 3]
+def test_steps_equal_whole_episodes(preset, scan, memory, image):
+    encoder, lengths = make_encoder(image, preset, memory, scan=scan), [5, 3]
     tokens = make_tokens(image, sum(lengths))
     with th.no_grad():
         whole, _ = encoder(tokens, th.tensor(lengths))
