@@ -146,7 +146,7 @@ class ImageCNN(nn.Module):
     :param space: image space ``(channels, height, width)``, uint8 or float16
     :param convolutions: see ``Convolutions``
     :param fully_connected: width of each layer, at least one
-    :param scan: layers of an MLP over the images' :func:`column_scan`, beside the convolutions; empty: there is none
+    :param scan: layers of an MLP over the images' normalised :func:`column_scan`, beside the convolutions; empty: none
     :raises ValueError: if a layer is impossible, or the images are too small for the convolutions
     """
 
@@ -160,7 +160,8 @@ class ImageCNN(nn.Module):
                 "stride, max-pooling), at least 1 each, and there must be at least one fully connected layer."
             )
         n_channels, height, width = space.shape
-        self.scan = mlp(3 * n_channels * width, scan) if scan else None
+        self.scan_normalizer = RunningNormalizer(3 * n_channels * width) if scan else None
+        self.scan = mlp(3 * n_channels * width, scan)
         least = _least_size(convolutions)
         if min(height, width) < least:
             raise ValueError(
@@ -175,7 +176,7 @@ class ImageCNN(nn.Module):
             layers.append(nn.ELU())
             height, width = (((size - kernel) // stride + 1) // pooling for size in (height, width))
             n_channels = channels
-        # Channels last: oneDNN's convolutions take two thirds of the time that way round, see `make benchmark`.
+        # Channels last: a gray image's convolutions take about three quarters of the time that way round (oneDNN, one core).
         self.convolutions = nn.Sequential(*layers).to(memory_format=th.channels_last)  # type: ignore[call-overload]
         self.fully_connected = mlp(n_channels * height * width, fully_connected)
         self.fully_connected[-1] = RecoverableTanh()
@@ -183,15 +184,27 @@ class ImageCNN(nn.Module):
         """Number of features."""
         self.low, self.range = float(space.low.min()), float(space.high.max()) - float(space.low.min())
 
+    def update_normalizers(self, images: th.Tensor) -> None:
+        """
+        :param images: ``(n, channels, height, width)``, in the dtype of the space
+        """
+        if self.scan_normalizer is not None:
+            self.scan_normalizer.update(column_scan(self._pixels(images)))
+
+    def _pixels(self, images: th.Tensor) -> th.Tensor:
+        pixels = images.to(th.float32, copy=True, memory_format=th.channels_last)
+        return pixels.mul_(1.0 / self.range).sub_(self.low / self.range + 0.5)  # in place: the largest tensor that there is
+
     def forward(self, images: th.Tensor) -> th.Tensor:
         """
         :param images: ``(n, channels, height, width)``, in the dtype of the space
         :return: ``(n, width)``
         """
-        pixels = images.to(th.float32, copy=True, memory_format=th.channels_last)
-        pixels.mul_(1.0 / self.range).sub_(self.low / self.range + 0.5)  # in place: the largest tensor that there is
+        pixels = self._pixels(images)
         features = self.fully_connected(self.convolutions(pixels).permute(0, 2, 3, 1).flatten(1))
-        return features if self.scan is None else th.cat((features, self.scan(column_scan(pixels))), dim=1)
+        if self.scan_normalizer is None:
+            return features
+        return th.cat((features, self.scan(self.scan_normalizer(column_scan(pixels)))), dim=1)
 
 
 def _least_size(convolutions: Convolutions) -> int:
@@ -271,6 +284,8 @@ class TokenFeatures(nn.Module):
             self.common_normalizer.update(self._common_vector(tokens))
         if self.has_vector_target:
             self.target_normalizer.update(tokens[TARGET].float())
+        if self.has_image:
+            self.image.update_normalizers(tokens[TARGET])
 
     def forward(self, tokens: Tokens) -> th.Tensor:
         """

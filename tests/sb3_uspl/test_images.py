@@ -110,7 +110,7 @@ def test_numbers_reach_the_cnn_within_one_unit(image):
 def test_a_column_scan_hand_counted(image):
     cnn = ImageCNN(image, SMALL, (64,), scan=(8,))
     seen = []
-    cnn.scan.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    cnn.scan_normalizer.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
     picture = image.high.copy()
     middle = 0.5 * (image.low[0, 0, 0] + image.high[0, 0, 0])
     picture[0, 9:, 3] = middle  # three quarters of the fourth column
