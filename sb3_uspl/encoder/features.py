@@ -176,7 +176,7 @@ class ImageCNN(nn.Module):
             layers.append(nn.ELU())
             height, width = (((size - kernel) // stride + 1) // pooling for size in (height, width))
             n_channels = channels
-        # Channels last: a gray image's convolutions take about three quarters of the time that way round (oneDNN, one core).
+        # Channels last is the faster way round for oneDNN's convolutions of gray images.
         self.convolutions = nn.Sequential(*layers).to(memory_format=th.channels_last)  # type: ignore[call-overload]
         self.fully_connected = mlp(n_channels * height * width, fully_connected)
         self.fully_connected[-1] = RecoverableTanh()
