@@ -8,13 +8,14 @@ from sb3_uspl.encoder import ObservationEncoder
 from tests.sb3_uspl.toy import ToyEnv
 
 
-def test_recoverable_tanh_is_tanh_but_for_the_way_back_to_zero():
+@pytest.mark.parametrize("leak", [0.0, 0.01, 1.0])
+def test_recoverable_tanh_is_tanh_but_for_the_way_back_to_zero(leak):
     x = th.tensor([-3.0, -0.5, 0.5, 3.0], requires_grad=True)
-    y, slope = recoverable_tanh(x), 1.0 - th.tanh(x.detach()) ** 2
+    y, slope = recoverable_tanh(x, leak), 1.0 - th.tanh(x.detach()) ** 2
     assert th.equal(y, th.tanh(x))
     inwards = th.autograd.grad(y, x, th.sign(x), retain_graph=True)[0]
     outwards = th.autograd.grad(y, x, -th.sign(x))[0]
-    assert th.equal(inwards, th.sign(x.detach()))
+    assert th.allclose(inwards, th.sign(x.detach()) * slope.clamp(min=leak))
     assert th.allclose(outwards, -th.sign(x.detach()) * slope)
 
 
