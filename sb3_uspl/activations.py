@@ -6,8 +6,8 @@ import torch as th
 from torch import nn
 
 LEAK = 0.01
-"""Least slope towards zero in an encoder. Adam divides by the size of the gradients, so that this little leads out of saturation
-as well; with 1, an encoder that is saturated on purpose is torn down (see :class:`RecoverableTanh`)."""
+"""Least slope towards zero in an encoder. Adam divides by the size of the gradients, so that this little leads out of
+saturation as well; with 1, an encoder that is saturated on purpose is torn down (see :class:`RecoverableTanh`)."""
 
 
 class _RecoverableTanh(th.autograd.Function):
@@ -53,8 +53,8 @@ class RecoverableTanh(nn.Module):
       0.8 M decisions, +-750 after 0.9 M with twice the learning rate.)
 
     It is not the gradient of the result where that is far from 0: what pulls an input towards zero counts for more than what
-    pushes it away. The greater ``leak``, the more an embedding that is saturated on purpose is torn down, see "Training on, with
-    legs" in ``docs/full_physics.md``.
+    pushes it away. The greater ``leak``, the more an embedding that is saturated on purpose is torn down, see "Training on,
+    with legs" in ``docs/full_physics.md``.
 
     :param leak: least slope towards zero, in [0, 1]
     """

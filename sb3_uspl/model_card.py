@@ -3,11 +3,14 @@
 
 An agent's folder is the zoo's: ``<algo>/<env>_<n>/`` with ``<env>.zip``, ``<env>/args.yml``, ``<env>/config.yml`` and
 ``progress.csv``. Beside them this writes ``evaluation.json`` and ``README.md``; what ``notes.md`` says is taken into the card.
+An agent that was trained on (``-i``) is shipped with the command line of the training before, ``<env>/first_args.yml``, and
+with the progress of both.
 """
 
 import argparse
 import contextlib
 import hashlib
+import itertools
 import json
 import shlex
 import shutil
@@ -23,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TRAINED_AGENTS = ROOT / "trained_agents"
 EPISODES = 500
 EVALUATION, CARD, NOTES, PROGRESS = "evaluation.json", "README.md", "notes.md", "progress.csv"
+ARGUMENTS, FIRST_ARGUMENTS = "args.yml", "first_args.yml"
 BEGIN, END = "<!-- agents: begin -->", "<!-- agents: end -->"
 """Between these lines of the project's README lies the table."""
 
@@ -49,7 +53,7 @@ class Agent:
 
     def __post_init__(self) -> None:
         missing = [
-            path for path in (self.model, self.settings / "args.yml", self.settings / "config.yml") if not path.is_file()
+            path for path in (self.model, self.settings / ARGUMENTS, self.settings / "config.yml") if not path.is_file()
         ]
         if missing:
             names = ", ".join(str(path.relative_to(self.folder)) for path in missing)
@@ -87,7 +91,7 @@ class Agent:
 
     def arguments(self) -> dict[str, Any]:
         """:return: command line of the training"""
-        return _read_settings(self.settings / "args.yml")
+        return _read_settings(self.settings / ARGUMENTS)
 
     def hyperparameters(self) -> dict[str, Any]:
         """:return: of the training"""
@@ -109,17 +113,23 @@ class Agent:
         decisions, seconds = (max(column) if len(column) else None for column in values)
         return (None if decisions is None else int(decisions)), (None if seconds is None else float(seconds))
 
-    def command(self) -> str:
-        """:return: what trained it"""
+    def commands(self) -> list[str]:
+        """:return: what trained it: one command, or two if it was trained on"""
         given = self.arguments()
-        parts = ["python -m sb3_uspl.train", "--algo", self.algo, "--env", self.env, "--seed", str(given.get("seed"))]
+        first = self.settings / FIRST_ARGUMENTS
+        if not given.get("trained_agent") or not first.is_file():
+            return [self._command(given)]
+        model = f"logs/{self.algo}/{self.env}_1/{Path(given['trained_agent']).name}"
+        return [self._command(_read_settings(first)), self._command(given, f"-i {shlex.quote(model)}")]
+
+    def _command(self, given: dict[str, Any], *more: str) -> str:
+        parts = ["python -m sb3_uspl.train", "--algo", self.algo, "--env", self.env, "--seed", str(given.get("seed")), *more]
         for name, (option, default) in _COMMAND_OPTIONS.items():
             if given.get(name, default) != default:
                 parts += [option, str(given[name])]
-        if given.get("env_kwargs"):
-            parts += ["--env-kwargs", *(shlex.quote(f"{key}:{value!r}") for key, value in given["env_kwargs"].items())]
-        if given.get("hyperparams"):
-            parts += ["-params", *(shlex.quote(f"{key}:{value!r}") for key, value in given["hyperparams"].items())]
+        for name, option in (("env_kwargs", "--env-kwargs"), ("hyperparams", "-params")):
+            if given.get(name):
+                parts += [option, *(shlex.quote(f"{key}:{value!r}") for key, value in given[name].items())]
         return " ".join(parts)
 
 
@@ -133,7 +143,7 @@ def agents(folder: Path = TRAINED_AGENTS) -> list[Agent]:
     :param folder: log folder
     :return: the agents in it, by environment and algorithm
     """
-    found = (Agent(path.parent.parent) for path in folder.glob("*/*_*/*/args.yml"))
+    found = (Agent(path.parent.parent) for path in folder.glob(f"*/*_*/*/{ARGUMENTS}"))
     return sorted(
         found, key=lambda agent: (agent.env, list(_NAMES).index(agent.algo) if agent.algo in _NAMES else 99, agent.number)
     )
@@ -155,13 +165,29 @@ def ship(run: Path, best: bool = False, folder: Path = TRAINED_AGENTS) -> Agent:
         raise ValueError(f"{run} has no {model.name}; was it trained with --eval-freq?")
     target = folder / given.algo / f"{given.env}_1"
     (target / given.env).mkdir(parents=True, exist_ok=True)
+    _ship_history(given, target)
     shutil.copy(model, target / given.model.name)
-    for path in (given.settings / "args.yml", given.settings / "config.yml", given.settings / "vecnormalize.pkl"):
+    for path in (given.settings / ARGUMENTS, given.settings / "config.yml", given.settings / "vecnormalize.pkl"):
         if path.is_file():
             shutil.copy(path, target / given.env / path.name)
-    if (run / PROGRESS).is_file():
-        shutil.copy(run / PROGRESS, target / PROGRESS)
     return Agent(target)
+
+
+def _ship_history(run: Agent, target: Path) -> None:
+    """The progress of a training, and of the one that it went on from; the latter's folder may be ``target`` itself."""
+    history = [run.folder / PROGRESS]
+    (target / run.env / FIRST_ARGUMENTS).unlink(missing_ok=True)
+    if run.arguments().get("trained_agent"):
+        first = Path(run.arguments()["trained_agent"]).parent
+        if not (first / run.env / ARGUMENTS).is_file():
+            raise ValueError(f"{run.folder} was trained on from {first}, where there is no {run.env}/{ARGUMENTS}.")
+        shutil.copy(first / run.env / ARGUMENTS, target / run.env / FIRST_ARGUMENTS)
+        history.insert(0, first / PROGRESS)
+    frames = [pd.read_csv(path) for path in history if path.is_file()]
+    for before, after in itertools.pairwise(frames):
+        after["time/time_elapsed"] += before["time/time_elapsed"].max()
+    if frames:
+        pd.concat(frames).to_csv(target / PROGRESS, index=False)
 
 
 def measure(agent: Agent, episodes: int = EPISODES) -> dict[str, Any]:
@@ -231,7 +257,7 @@ def card(agent: Agent) -> str:
     if result.get("prediction_error_final") is not None:
         rows.append(("prediction error at the end", f"{result['prediction_error_final']:.3f} privileged units"))
     rows += [
-        ("made by", f"`{agent.command()}`"),
+        ("made by", ", then ".join(f"`{command}`" for command in agent.commands())),
         ("check it", f"`python -m sb3_uspl.evaluate --algo {agent.algo} --env {agent.env}`"),
         ("watch it", f"`python -m sb3_uspl.record_video --algo {agent.algo} --env {agent.env} --film film.mp4`"),
     ]
@@ -276,7 +302,7 @@ def table(found: list[Agent]) -> str:
         rates = [_success(result, prefix) if result else "not evaluated" for prefix in ("", "privileged_")]
         decisions, seconds = agent.training()
         name = f"{_NAMES.get(agent.algo, agent.algo)}, {agent.arguments().get('seed')}"
-        numbers = (_decisions(decisions), _clock(seconds), f"`{agent.command()}`")
+        numbers = (_decisions(decisions), _clock(seconds), ", then ".join(f"`{command}`" for command in agent.commands()))
         link = f"[`{agent.env}`](trained_agents/{agent.algo}/{agent.env}_{agent.number}/README.md)"
         lines.append("| " + " | ".join((link, name, *rates, *numbers)) + " |")
     return "\n".join(lines)

@@ -75,10 +75,28 @@ def test_what_is_shipped_is_what_was_asked_for(tmp_path):
     assert last.digest == run.digest and last.training() == run.training() == (2_000_896, 299.0)
     assert last.evaluation() is None, "it is evaluated where it is shipped"
     best = ship(run.folder, best=True, folder=tmp_path / "agents")
-    assert best.model.read_bytes() == b"better weights" and best.command() == run.command()
+    assert best.model.read_bytes() == b"better weights" and best.commands() == run.commands()
     (run.folder / "best_model.zip").unlink()
     with pytest.raises(ValueError, match="best_model"):
         ship(run.folder, best=True, folder=tmp_path / "agents")
+
+
+def test_an_agent_that_was_trained_on_is_shipped_with_both_commands_and_times(tmp_path):
+    first = ship(write_agent(tmp_path / "logs").folder, folder=tmp_path / "agents")
+    run = write_agent(tmp_path / "more")
+    arguments = {"seed": 8, "n_timesteps": 1000, "trained_agent": str(first.model), "hyperparams": {"gamma": 0.98}}
+    (run.settings / "args.yml").write_text(yaml.dump(arguments))
+    (run.folder / "progress.csv").write_text("time/total_timesteps,time/time_elapsed\n2001896,100\n")
+    begun_with, last = first.commands()[0], ship(run.folder, folder=tmp_path / "agents")
+    assert last.folder == first.folder and last.training() == (2_001_896, 399.0)
+    model = "-i logs/uspl_ppo/LateralChoice-v0_1/LateralChoice-v0.zip"
+    assert last.commands() == [
+        begun_with,
+        f"python -m sb3_uspl.train --algo uspl_ppo --env LateralChoice-v0 --seed 8 {model} -n 1000 -params gamma:0.98",
+    ]
+    (first.settings / "args.yml").unlink()
+    with pytest.raises(ValueError, match="trained on from"):
+        ship(run.folder, folder=tmp_path / "elsewhere")
 
 
 def test_a_folder_that_is_no_agent_is_refused(tmp_path):
