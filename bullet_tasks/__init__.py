@@ -1,5 +1,7 @@
 """Small PyBullet worlds in which a robot must gather information before it acts; importing registers them with gymnasium."""
 
+from typing import Any
+
 import gymnasium
 
 from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotor
@@ -13,7 +15,7 @@ from bullet_tasks.tasks.square_maze import SquareMaze
 from bullet_tasks.tasks.stairway_search import StairwaySearch
 
 # Environment id -> task class. The task module's ``make_env`` builds the environment.
-_TASKS = {
+_TASKS: dict[str, type[Any]] = {
     "LateralChoice-v0": LateralChoice,
     "SquareMaze-v0": SquareMaze,
     "SignpostNav-v0": SignpostNav,

@@ -2,8 +2,9 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -18,6 +19,7 @@ from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Colour, Shape
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start, Task
+from bullet_tasks.tasks.configuration import configured
 
 PRIVILEGED_BOUND = 0.4
 """Bound of each privileged number; a uniform distribution within has the standard deviation 0.231."""
@@ -181,14 +183,14 @@ class BiasedQuadrotor(Task):
     Source
         Uncertainty-Sensitive Privileged Learning, App. C.1.7, Table 3, Figures 7 and 14; not in the authors' release.
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
     picture_size = (640, 400)
 
-    def __init__(self, config: BiasedQuadrotorConfig | None = None) -> None:
-        self.config = c = config or BiasedQuadrotorConfig()
+    def __init__(self, config: BiasedQuadrotorConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = c = configured(BiasedQuadrotorConfig(), config)
         self.decision_period, self.time_limit = c.decision_period, c.time_limit
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.common_space = spaces.Box(-1.0, 1.0, (8,), np.float32)
@@ -346,14 +348,14 @@ class BiasedQuadrotor(Task):
 
 
 def make_env(
-    physics: str = "kinematic", render_mode: str | None = None, config: BiasedQuadrotorConfig | None = None
+    physics: str = "kinematic", render_mode: str | None = None, config: BiasedQuadrotorConfig | Mapping[str, Any] | None = None
 ) -> RobotTaskEnv:
     """
     Build ``BiasedQuadrotor-v0``.
 
     :param physics: of the robot, see ``make_quadrotor``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if an argument is not a possible choice
     """
     check_quadrotor_physics(physics)

@@ -2,8 +2,9 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -25,6 +26,7 @@ from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Colour, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Outcome, Start, Task
+from bullet_tasks.tasks.configuration import configured
 
 _COLOURS: dict[str, Colour] = {
     "red": (0.84, 0.16, 0.14, 1.0),
@@ -188,7 +190,7 @@ class BlindMassStack(Task):
     Source
         Uncertainty-Sensitive Privileged Learning, App. C.1.3, task Blind-Mass Stack; not in the authors' release.
 
-    :param config: masses, sizes, times and weights
+    :param config: masses, sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
@@ -197,8 +199,8 @@ class BlindMassStack(Task):
     decision_period = DECISION_PERIOD
     discrete_privileged = {0: (-INDEX_SCALE, 0.0, INDEX_SCALE)}  # noqa: RUF012 (a mapping that nobody writes to)
 
-    def __init__(self, config: BlindMassStackConfig | None = None) -> None:
-        self.config = config = config or BlindMassStackConfig()
+    def __init__(self, config: BlindMassStackConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = config = configured(BlindMassStackConfig(), config)
         self.time_limit = config.n_decisions * DECISION_PERIOD
         self.action_space = spaces.MultiDiscrete([N_PLACES, len(HEIGHTS), 2])
         # Positions of cubes and hand, green cube, grasp, held cube; readings.
@@ -366,14 +368,14 @@ def _stands_on(upper: Vector3, lower: Vector3) -> bool:
 
 
 def make_env(
-    physics: str = "kinematic", render_mode: str | None = None, config: BlindMassStackConfig | None = None
+    physics: str = "kinematic", render_mode: str | None = None, config: BlindMassStackConfig | Mapping[str, Any] | None = None
 ) -> RobotTaskEnv:
     """
     Build ``BlindMassStack-v0``.
 
     :param physics: of the arm, see ``make_panda``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: masses, sizes, times and weights
+    :param config: masses, sizes, times and weights, whole or the values that are different
     :raises ValueError: if an argument is not a possible choice
     """
     check_physics(physics)

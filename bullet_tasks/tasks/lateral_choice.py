@@ -2,7 +2,9 @@
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -13,6 +15,7 @@ from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Colour, Cylinder
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
+from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.navigation import NavigationReward, NavigationTask
 
 _FLOOR: Colour = (0.86, 0.87, 0.84, 1.0)
@@ -123,15 +126,15 @@ class LateralChoice(NavigationTask):
         Uncertainty-Sensitive Privileged Learning, task Lateral Choice; geometry and rewards measured in the authors'
         release (``left_right_choose``).
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
     camera = Camera(eye=(0.0, -6.0, 18.0), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), fov=9.6)
     picture_size = (800, 208)
 
-    def __init__(self, config: LateralChoiceConfig | None = None) -> None:
-        self.config = config = config or LateralChoiceConfig()
+    def __init__(self, config: LateralChoiceConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = config = configured(LateralChoiceConfig(), config)
         super().__init__(config.decision_period, config.time_limit, config.goal_radius, config.reward)
         self.privileged_space = spaces.Box(-config.privileged_bound, config.privileged_bound, (1,), np.float32)
         self.scene = self._scene()
@@ -190,14 +193,14 @@ class LateralChoice(NavigationTask):
 
 
 def make_env(
-    physics: str = "kinematic", render_mode: str | None = None, config: LateralChoiceConfig | None = None
+    physics: str = "kinematic", render_mode: str | None = None, config: LateralChoiceConfig | Mapping[str, Any] | None = None
 ) -> RobotTaskEnv:
     """
     Build ``LateralChoice-v0``.
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if an argument is not a possible choice
     """
     check_physics(physics)

@@ -2,7 +2,9 @@
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from bullet_tasks.sensors.scandots import Scandots
 from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
+from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.corners import CORNERS, CornerTask
 from bullet_tasks.tasks.navigation import NavigationReward
 
@@ -142,15 +145,15 @@ class MidpointChoice(CornerTask):
         Uncertainty-Sensitive Privileged Learning, task Midpoint Choice with scandots; geometry and rewards measured in the
         authors' release (``middle_choose``).
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
     camera = Camera(eye=(0.0, -8.0, 12.0), target=(0.0, -0.22, 0.0), up=(0.0, 1.0, 0.0), fov=22.0)
     picture_size = (640, 540)
 
-    def __init__(self, config: MidpointChoiceConfig | None = None) -> None:
-        self.config = c = config or MidpointChoiceConfig()
+    def __init__(self, config: MidpointChoiceConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = c = configured(MidpointChoiceConfig(), config)
         super().__init__((c.corner, c.corner), c.decision_period, c.time_limit, c.goal_radius, c.reward)
         # Columns cannot change their height: the tallest possible ones are sunk into the ground by what is too much.
         self._column_length = c.drop + c.low_height[1] + c.middle_step[1] + c.tall_step[1]
@@ -209,14 +212,14 @@ class MidpointChoice(CornerTask):
 
 
 def make_env(
-    physics: str = "kinematic", render_mode: str | None = None, config: MidpointChoiceConfig | None = None
+    physics: str = "kinematic", render_mode: str | None = None, config: MidpointChoiceConfig | Mapping[str, Any] | None = None
 ) -> RobotTaskEnv:
     """
     Build ``MidpointChoice-v0``.
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if an argument is not a possible choice
     """
     check_physics(physics)

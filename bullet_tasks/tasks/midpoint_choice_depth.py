@@ -1,8 +1,12 @@
 """Midpoint Choice with a depth camera instead of scandots, on a larger platform."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from bullet_tasks.env import RobotTaskEnv
 from bullet_tasks.sensors.camera import SMALL, Intrinsics
 from bullet_tasks.simulation import Camera
+from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.midpoint_choice import MidpointChoice, MidpointChoiceConfig
 from bullet_tasks.tasks.seeing import make_seeing_env
 
@@ -52,20 +56,20 @@ class MidpointChoiceDepth(MidpointChoice):
         Uncertainty-Sensitive Privileged Learning, task Midpoint Choice (image); geometry and rewards measured in the authors'
         release (``middle_choose_image``).
 
-    :param config: sizes, times and weights; by default ``LARGE``
+    :param config: sizes, times and weights, whole or the values that differ from ``LARGE``
     :raises ValueError: if the configuration is not a possible world
     """
 
     camera = Camera(eye=(0.0, -11.0, 16.5), target=(0.0, -0.3, 0.0), up=(0.0, 1.0, 0.0), fov=22.0)
 
-    def __init__(self, config: MidpointChoiceConfig | None = None) -> None:
-        super().__init__(config or LARGE)
+    def __init__(self, config: MidpointChoiceConfig | Mapping[str, Any] | None = None) -> None:
+        super().__init__(configured(LARGE, config))
 
 
 def make_env(
     physics: str = "kinematic",
     render_mode: str | None = None,
-    config: MidpointChoiceConfig | None = None,
+    config: MidpointChoiceConfig | Mapping[str, Any] | None = None,
     lens: Intrinsics = SMALL,
     back_end: str = "compiled",
 ) -> RobotTaskEnv:
@@ -74,7 +78,7 @@ def make_env(
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights; by default ``LARGE``
+    :param config: sizes, times and weights, whole or the values that differ from ``LARGE``
     :param lens: of the camera, see ``bullet_tasks.sensors.camera``
     :param back_end: who takes the images, see ``DepthCamera``
     :raises ValueError: if an argument is not a possible choice

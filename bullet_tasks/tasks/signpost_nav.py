@@ -2,7 +2,9 @@
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -14,6 +16,7 @@ from bullet_tasks.sensors.scandots import Scandots
 from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
+from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.navigation import NavigationReward, NavigationTask
 
 _FLOOR: Colour = (0.86, 0.87, 0.84, 1.0)
@@ -151,15 +154,15 @@ class SignpostNav(NavigationTask):
         Uncertainty-Sensitive Privileged Learning, task Signpost Nav; geometry and rewards measured in the authors' release
         (``circle``).
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
     camera = Camera(eye=(0.68, -6.0, 20.0), target=(0.68, -0.1, 0.0), up=(0.0, 1.0, 0.0), fov=25.0)
     picture_size = (680, 580)
 
-    def __init__(self, config: SignpostNavConfig | None = None) -> None:
-        self.config = c = config or SignpostNavConfig()
+    def __init__(self, config: SignpostNavConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = c = configured(SignpostNavConfig(), config)
         super().__init__(c.decision_period, c.time_limit, c.goal_radius, c.reward)
         self.privileged_space = spaces.Box(-c.privileged_bound, c.privileged_bound, (2,), np.float32)
         # As long as the shortest signpost, and from the ground up, as they reach beyond the rim.
@@ -222,14 +225,14 @@ class SignpostNav(NavigationTask):
 
 
 def make_env(
-    physics: str = "kinematic", render_mode: str | None = None, config: SignpostNavConfig | None = None
+    physics: str = "kinematic", render_mode: str | None = None, config: SignpostNavConfig | Mapping[str, Any] | None = None
 ) -> RobotTaskEnv:
     """
     Build ``SignpostNav-v0``.
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if an argument is not a possible choice
     """
     check_physics(physics)

@@ -1,5 +1,8 @@
 """Signpost Nav with a depth camera instead of scandots."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from bullet_tasks.env import RobotTaskEnv
 from bullet_tasks.sensors.camera import SMALL, Intrinsics
 from bullet_tasks.tasks.seeing import make_seeing_env
@@ -46,7 +49,7 @@ class SignpostNavDepth(SignpostNav):
         Uncertainty-Sensitive Privileged Learning, task Signpost Nav (image); geometry and rewards measured in the authors'
         release (``circle_image``).
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
@@ -54,7 +57,7 @@ class SignpostNavDepth(SignpostNav):
 def make_env(
     physics: str = "kinematic",
     render_mode: str | None = None,
-    config: SignpostNavConfig | None = None,
+    config: SignpostNavConfig | Mapping[str, Any] | None = None,
     lens: Intrinsics = SMALL,
     back_end: str = "compiled",
 ) -> RobotTaskEnv:
@@ -63,7 +66,7 @@ def make_env(
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :param lens: of the camera, see ``bullet_tasks.sensors.camera``
     :param back_end: who takes the images, see ``DepthCamera``
     :raises ValueError: if an argument is not a possible choice

@@ -2,7 +2,9 @@
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from bullet_tasks.scene import PARKED, SceneSpec
 from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
+from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.corners import CornerTask
 from bullet_tasks.tasks.navigation import NavigationReward
 
@@ -141,15 +144,15 @@ class SquareMaze(CornerTask):
         Uncertainty-Sensitive Privileged Learning, task Square Maze; geometry and rewards measured in the authors' release
         (``four_corners``).
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
     camera = Camera(eye=(0.15, -5.0, 18.0), target=(0.15, -0.05, 0.0), up=(0.0, 1.0, 0.0), fov=17.0)
     picture_size = (720, 480)
 
-    def __init__(self, config: SquareMazeConfig | None = None) -> None:
-        self.config = c = config or SquareMazeConfig()
+    def __init__(self, config: SquareMazeConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = c = configured(SquareMazeConfig(), config)
         super().__init__(c.goal, c.decision_period, c.time_limit, c.goal_radius, c.reward)
         self._closed = {name: self._closing(name) for name in _POCKETS}
         self._open = {name: self._pocket(name) for name in _POCKETS}
@@ -250,14 +253,14 @@ class SquareMaze(CornerTask):
 
 
 def make_env(
-    physics: str = "kinematic", render_mode: str | None = None, config: SquareMazeConfig | None = None
+    physics: str = "kinematic", render_mode: str | None = None, config: SquareMazeConfig | Mapping[str, Any] | None = None
 ) -> RobotTaskEnv:
     """
     Build ``SquareMaze-v0``.
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if an argument is not a possible choice
     """
     check_physics(physics)

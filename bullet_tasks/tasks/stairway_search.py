@@ -1,8 +1,9 @@
 """Stairway Search: four corner platforms look alike, but stairs lead down from one, which is seen only over the edge."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -15,6 +16,7 @@ from bullet_tasks.sensors.camera import SMALL, Intrinsics
 from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
+from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.corners import CORNERS, CornerTask
 from bullet_tasks.tasks.navigation import MAX_TURN, NavigationReward
 from bullet_tasks.tasks.seeing import make_seeing_env
@@ -146,15 +148,15 @@ class StairwaySearch(CornerTask):
         Uncertainty-Sensitive Privileged Learning, task Stairway Search; geometry and rewards measured in the authors' release
         (``stair_find_image``).
 
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :raises ValueError: if the configuration is not a possible world
     """
 
     camera = Camera(eye=(0.0, -9.0, 13.5), target=(0.0, -0.25, 0.0), up=(0.0, 1.0, 0.0), fov=22.0)
     picture_size = (640, 540)
 
-    def __init__(self, config: StairwaySearchConfig | None = None) -> None:
-        self.config = c = config or StairwaySearchConfig()
+    def __init__(self, config: StairwaySearchConfig | Mapping[str, Any] | None = None) -> None:
+        self.config = c = configured(StairwaySearchConfig(), config)
         super().__init__((c.corner, c.corner), c.decision_period, c.time_limit, c.goal_radius, c.reward)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.common_space = spaces.Box(-1.0, 1.0, (5,), np.float32)
@@ -236,7 +238,7 @@ class StairwaySearch(CornerTask):
 def make_env(
     physics: str = "kinematic",
     render_mode: str | None = None,
-    config: StairwaySearchConfig | None = None,
+    config: StairwaySearchConfig | Mapping[str, Any] | None = None,
     lens: Intrinsics = SMALL,
     back_end: str = "compiled",
 ) -> RobotTaskEnv:
@@ -245,7 +247,7 @@ def make_env(
 
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param config: sizes, times and weights
+    :param config: sizes, times and weights, whole or the values that are different
     :param lens: of the camera, see ``bullet_tasks.sensors.camera``
     :param back_end: who takes the images, see ``DepthCamera``
     :raises ValueError: if an argument is not a possible choice
