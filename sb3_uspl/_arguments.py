@@ -57,6 +57,7 @@ def check_arguments(model: "USPLPPO") -> None:
             raise ValueError(
                 f"action_std={model.action_std}: give one positive number, or one for each of the {n_action} action values."
             )
+    check_wander_actions(model.wander_actions, model.action_space)
     ranges = {
         "warmup_timesteps": (model.warmup_timesteps or 0, 0, np.inf),
         "ramp_timesteps": (model.ramp_timesteps or 0, 0, np.inf),
@@ -78,6 +79,23 @@ def check_arguments(model: "USPLPPO") -> None:
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
             raise ValueError(f"{name}={value} is outside of its range [{low}, {high}].")
+
+
+def check_wander_actions(chosen: dict[int, float] | None, space: spaces.Space) -> None:
+    """
+    :param chosen: components of the action and what each is drawn around
+    :param space: action space
+    :raises ValueError: if the space is not a Box with these components and values
+    """
+    if chosen is None:
+        return
+    if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and isinstance(chosen, dict) and chosen):
+        raise ValueError(f"wander_actions={chosen}: a dict {{component: middle}}, for a flat Box action space, not {space}.")
+    for component, middle in chosen.items():
+        if not (0 <= component < space.shape[0] and space.low[component] <= middle <= space.high[component]):
+            raise ValueError(
+                f"wander_actions={chosen}: there must be a component {component}, and {middle} be within its bounds, in {space}."
+            )
 
 
 def count_mismatched(fraction: float | None, n_envs: int) -> int:

@@ -100,6 +100,9 @@ class USPLPPO(PPO):
     :param wander_share: share of time in which a mismatched environment repeats a random action of its own, so that the
         encoder sees what the policy does not look at yet (0 in the release)
     :param wander_time: least and greatest length of such a stretch in s
+    :param wander_actions: components of a continuous action that are drawn at random there, and what each is drawn around,
+        e.g. ``{1: 0.6}``, where the policy has no reason yet to turn a camera to what is to be seen; the others stay the
+        policy's. None: all, around the middle of the action space.
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
     :param replay_bytes: memory budget of the episode replay
     :param encoder_learning_rate: of the encoder; constant, as in the release, unless a schedule is given (Tables 4 and 5: 5e-5
@@ -181,6 +184,7 @@ class USPLPPO(PPO):
         mismatch_hold_time: tuple[float, float] | None = None,
         wander_share: float = 0.0,
         wander_time: tuple[float, float] = (0.5, 5.0),
+        wander_actions: dict[int, float] | None = None,
         replay: str = "mismatched",
         replay_bytes: int = 256_000_000,
         encoder_learning_rate: float | Schedule = 1e-3,
@@ -246,7 +250,7 @@ class USPLPPO(PPO):
         self.smoothing_time, self.decision_period = smoothing_time, decision_period
         self.mismatch_fraction = mismatch_fraction
         self.mismatch_hold_time = mismatch_hold_time
-        self.wander_share, self.wander_time = wander_share, wander_time
+        self.wander_share, self.wander_time, self.wander_actions = wander_share, wander_time, wander_actions
         self.replay, self.replay_bytes = replay, replay_bytes
         self.encoder_learning_rate, self.encoder_learning_rate_floor = encoder_learning_rate, encoder_learning_rate_floor
         self.encoder_weight_decay = encoder_weight_decay
@@ -318,6 +322,7 @@ class USPLPPO(PPO):
             mismatch_hold=hold and in_decisions("mismatch_hold_time", hold, period),
             wander_share=self.wander_share,
             wander_hold=in_decisions("wander_time", self.wander_time, period),
+            wander_actions=self.wander_actions,
         )
         self._rollout_env = None
 

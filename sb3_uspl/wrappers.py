@@ -56,6 +56,7 @@ class UncertaintyConfig:
     mismatch_hold: tuple[float, float] | None = None
     wander_share: float = 0.0
     wander_hold: tuple[float, float] = (1.0, 1.0)
+    wander_actions: dict[int, float] | None = None
 
 
 class BlurNoise:
@@ -105,10 +106,25 @@ class Wandering:
     :param share: of time that each environment spends wandering, ``(n_envs,)``
     :param hold: least and greatest length of a stretch in decisions
     :param rng: random generator
+    :param chosen: components of a continuous action that wander, and what each is drawn around; None: all, around the middle
     """
 
-    def __init__(self, action_space: spaces.Space, share: np.ndarray, hold: tuple[float, float], rng: np.random.Generator):
+    def __init__(
+        self,
+        action_space: spaces.Space,
+        share: np.ndarray,
+        hold: tuple[float, float],
+        rng: np.random.Generator,
+        chosen: dict[int, float] | None = None,
+    ):
         self.action_space, self.share, self.rng = action_space, share, rng
+        self.taken = np.ones(action_space.shape or (), dtype=bool)
+        if isinstance(action_space, spaces.Box):
+            self.middle = 0.5 * (action_space.low + action_space.high)
+        if chosen is not None:
+            self.taken[:] = False
+            for component, middle in chosen.items():
+                self.taken[component], self.middle[component] = True, middle
         self.log_hold = math.log(hold[0]), math.log(hold[1])
         self.left = np.zeros(len(share), dtype=np.int64)
         self.active = np.zeros(len(share), dtype=bool)
@@ -130,15 +146,15 @@ class Wandering:
         :return: those that are taken
         """
         active = self.active.reshape(-1, *[1] * (actions.ndim - 1))
-        return np.where(active, self.actions, actions).astype(actions.dtype)
+        return np.where(active & self.taken, self.actions, actions).astype(actions.dtype)
 
     def _draw(self) -> Any:
         space = self.action_space
         if not isinstance(space, spaces.Box):
             return space.sample()
-        middle, half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
+        half = 0.5 * (space.high - space.low)
         spread = self.rng.uniform(size=space.shape) ** 3
-        return np.clip(middle + half * spread * self.rng.standard_normal(space.shape), space.low, space.high)
+        return np.clip(self.middle + half * spread * self.rng.standard_normal(space.shape), space.low, space.high)
 
 
 class UncertaintyVecWrapper(VecEnvWrapper):
@@ -177,7 +193,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self._wandering = None
         if config.wander_share > 0.0:
             share = np.where(self._matched, 0.0, config.wander_share)
-            self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng)
+            self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng, config.wander_actions)
 
     def reset(self) -> VecEnvObs:
         return self.begin(self.venv.reset())  # type: ignore[arg-type]

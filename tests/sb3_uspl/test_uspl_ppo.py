@@ -457,6 +457,17 @@ def test_a_range_of_times_is_two_positive_numbers(name, times):
         USPLPPO("MlpPolicy", venv, n_steps=8, batch_size=16, mismatch_fraction=0.0, **{name: times})
 
 
+@pytest.mark.parametrize("chosen", [{1: 0.0}, {-1: 0.0}, {0: 1.5}, {0: np.nan}, {}, [0]], ids=str)
+def test_wander_actions_that_the_action_space_does_not_hold_are_refused(chosen):
+    with pytest.raises(ValueError, match="wander_actions="):
+        make_model(wander_share=0.5, wander_actions=chosen)
+
+
+def test_wander_actions_of_discrete_actions_are_refused():
+    with pytest.raises(ValueError, match="flat Box action space"):
+        make_model(wander_share=0.5, wander_actions={0: 0.0}, env_kwargs=dict(action_space=spaces.Discrete(3)))
+
+
 def test_a_policy_that_starts_anew_after_the_warm_up_keeps_the_encoder():
     venv = make_vec_env(ToyEnv, 8, seed=0)
     kwargs = dict(n_steps=8, batch_size=32, n_epochs=1, seed=0, ramp_timesteps=0, warmup_timesteps=128)
@@ -481,30 +492,3 @@ def test_a_policy_that_starts_anew_after_the_warm_up_keeps_the_encoder():
     held = {id(parameter) for group in model.policy.optimizer.param_groups for parameter in group["params"]}
     assert id(model.policy.action_net.weight) in held
     assert not held & {id(parameter) for parameter in model.policy.encoder.parameters()}
-
-
-@pytest.mark.parametrize("bounded", [True, False])
-def test_the_first_mean_action_is_the_chosen_one_before_training_and_after_a_restart(bounded):
-    space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 4.0]))
-    kwargs = dict(policy_kwargs=dict(initial_action=(-0.3, 3.0), bounded_mean=bounded), env_kwargs=dict(action_space=space))
-    model = make_model(**kwargs)
-    obs = model.env.reset()
-
-    def mean():
-        return model.predict(obs, deterministic=True)[0].mean(axis=0)
-
-    np.testing.assert_allclose(mean(), (-0.3, 3.0), atol=0.05)
-    with th.no_grad():
-        model.policy.action_net.bias.zero_()
-    model.policy.restart(model.lr_schedule)
-    np.testing.assert_allclose(mean(), (-0.3, 3.0), atol=0.05)
-
-
-@pytest.mark.parametrize("action", [(0.0,), (0.0, 1.0), (0.0, np.nan)], ids=["shape", "at the bound", "nan"])
-def test_an_initial_action_that_the_action_space_does_not_hold_is_refused(action):
-    with pytest.raises(ValueError, match=r"`initial_action` must be .* inside its bounds, got"):
-        make_model(
-            policy_kwargs=dict(initial_action=action), env_kwargs=dict(action_space=spaces.Box(-1, 1, (2,), np.float32))
-        )
-    with pytest.raises(ValueError, match="Box action space"):
-        make_model(policy_kwargs=dict(initial_action=(0.0,)), env_kwargs=dict(action_space=spaces.Discrete(3)))

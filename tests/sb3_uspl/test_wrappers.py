@@ -217,6 +217,20 @@ def test_wandering_repeats_actions_for_its_share_of_the_time():
     assert min(lengths) >= 2 and 7 <= max(lengths) <= 8
 
 
+def test_chosen_components_wander_around_their_values_and_the_others_are_the_policys():
+    space, n_envs = spaces.Box(-1.0, 1.0, (3,)), 300
+    wandering = Wandering(space, np.full(n_envs, 1.0), (2.0, 2.0), np.random.default_rng(0), {1: 0.6})
+    policys, taken = np.random.default_rng(1).uniform(-1.0, 1.0, (50, n_envs, 3)), []
+    for actions in policys:
+        wandering.advance()
+        taken.append(wandering.replace(actions))
+    taken = np.array(taken)
+    np.testing.assert_array_equal(taken[..., [0, 2]], policys[..., [0, 2]])
+    assert np.median(taken[..., 1]) == pytest.approx(0.6, abs=0.01) and 0.1 < taken[..., 1].std() < 0.5
+    assert taken[..., 1].min() >= -1.0 and taken[..., 1].max() <= 1.0
+    assert (taken[::2, :, 1] == taken[1::2, :, 1]).all() and (taken[0, :, 1] != taken[2, :, 1]).mean() > 0.8
+
+
 def test_only_mismatched_environments_wander():
     wrapper = make_wrapper(6, n_mismatched=2, wander_share=1.0, wander_hold=(3.0, 3.0))
     wrapper.reset()
