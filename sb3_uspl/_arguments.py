@@ -94,7 +94,7 @@ def check_wander_actions(chosen: dict[int, float] | None, space: spaces.Space) -
     for component, middle in chosen.items():
         if not (0 <= component < space.shape[0] and space.low[component] <= middle <= space.high[component]):
             raise ValueError(
-                f"wander_actions={chosen}: there must be a component {component}, and {middle} be within its bounds, in {space}."
+                f"wander_actions={chosen}: no component {component} that can be {middle} in {space}."
             )
 
 
