@@ -93,9 +93,7 @@ def check_wander_actions(chosen: dict[int, float] | None, space: spaces.Space) -
         raise ValueError(f"wander_actions={chosen}: a dict {{component: middle}}, for a flat Box action space, not {space}.")
     for component, middle in chosen.items():
         if not (0 <= component < space.shape[0] and space.low[component] <= middle <= space.high[component]):
-            raise ValueError(
-                f"wander_actions={chosen}: no component {component} that can be {middle} in {space}."
-            )
+            raise ValueError(f"wander_actions={chosen}: no component {component} that can be {middle} in {space}.")
 
 
 def count_mismatched(fraction: float | None, n_envs: int) -> int:
