@@ -71,6 +71,7 @@ def check_arguments(model: "USPLPPO") -> None:
         "encoder_updates": (model.encoder_updates, 0, np.inf),
         "encoder_batch_size": (model.encoder_batch_size, 1, np.inf),
         "context_length": (model.context_length, 1, np.inf),
+        "encoder_window": (1 if model.encoder_window is None else model.encoder_window, 1, np.inf),
         "encoder_beta": (model.encoder_beta, 0, 1),
         "wander_share": (model.wander_share, 0, 1),
         "mismatch_fraction": (model.mismatch_fraction or 0.0, 0, 0.9),

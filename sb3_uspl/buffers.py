@@ -43,6 +43,9 @@ class Episode:
     def __len__(self) -> int:
         return len(self.arrays[TRUTH])
 
+    def __getitem__(self, decisions: slice) -> "Episode":
+        return Episode({key: array[decisions] for key, array in self.arrays.items()}, self.mismatched)
+
     @property
     def nbytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values())
@@ -166,7 +169,9 @@ class EpisodeReplayBuffer:
         """Decisions of the episodes that :meth:`batches` can draw."""
         return sum(map(len, (*self._eligible_fresh(), *self.replay)))
 
-    def batches(self, n_batches: int, n_tokens: int, device: th.device | str = "cpu") -> Generator[EpisodeBatch, None, None]:
+    def batches(
+        self, n_batches: int, n_tokens: int, device: th.device | str = "cpu", window: int | None = None
+    ) -> Generator[EpisodeBatch, None, None]:
         """
         Draw whole episodes, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one if the other is
         empty. Nothing comes before the first episode has ended. Episodes with images are drawn whole, too: what they show has
@@ -177,9 +182,11 @@ class EpisodeReplayBuffer:
         :param n_batches: number of batches
         :param n_tokens: about how many decisions in each
         :param device: of the tensors
+        :param window: decisions in a row that are drawn of an episode, from anywhere in it; None: all. Episodes are as likely
+            as each other whatever their length.
         """
         for first in range(0, n_batches, self.STAGED_BATCHES):
-            chosen = [self._choose(n_tokens) for _ in range(first, min(first + self.STAGED_BATCHES, n_batches))]
+            chosen = [self._choose(n_tokens, window) for _ in range(first, min(first + self.STAGED_BATCHES, n_batches))]
             if not chosen[0]:
                 return
             unique = list({id(episode): episode for episodes in chosen for episode in episodes}.values())
@@ -199,14 +206,18 @@ class EpisodeReplayBuffer:
         only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
         return [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
 
-    def _choose(self, n_tokens: int) -> list[Episode]:
+    def _choose(self, n_tokens: int, window: int | None) -> list[Episode]:
         sources = [source for source in (self._eligible_fresh(), self.replay) if source]
         episodes: list[Episode] = []
         for source in sources:
             count = 0
             while count < n_tokens / len(sources):
-                episodes.append(source[int(self.rng.integers(len(source)))])
-                count += len(episodes[-1])
+                episode = source[int(self.rng.integers(len(source)))]
+                if window is not None and len(episode) > window:
+                    first = int(self.rng.integers(len(episode) - window + 1))
+                    episode = episode[first : first + window]
+                episodes.append(episode)
+                count += len(episode)
         return episodes
 
     def running_tokens(self, device: th.device | str = "cpu") -> tuple[Tokens, th.Tensor]:

@@ -115,6 +115,8 @@ class USPLPPO(PPO):
     :param encoder_max_grad_norm: gradient clipping of the encoder
     :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1 as it stands
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
+    :param encoder_window: decisions in a row, from anywhere in an episode, that the encoder learns from during the warm-up,
+        where one image that tells something is lost among the many of its episode (1: single ones); None: whole episodes
     :param encoder_bf16: whether the encoder's update computes in bfloat16 where torch's autocast deems it safe; for GPUs
     :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; takes minutes at the start, meant
         for the "paper" preset on a GPU
@@ -195,6 +197,7 @@ class USPLPPO(PPO):
         encoder_max_grad_norm: float = 1.0,
         encoder_beta: float = 0.5,
         encoder_warmup: bool = True,
+        encoder_window: int | None = None,
         encoder_bf16: bool = False,
         encoder_compile: bool = False,
         context_length: int = 1024,
@@ -256,7 +259,7 @@ class USPLPPO(PPO):
         self.encoder_weight_decay = encoder_weight_decay
         self.encoder_batch_size, self.encoder_updates = encoder_batch_size, encoder_updates
         self.encoder_max_grad_norm, self.encoder_warmup = encoder_max_grad_norm, encoder_warmup
-        self.encoder_beta = encoder_beta
+        self.encoder_beta, self.encoder_window = encoder_beta, encoder_window
         self.encoder_bf16, self.encoder_compile = encoder_bf16, encoder_compile
         self.context_length = context_length
         self._rollout_env: UncertaintyVecWrapper | None = None
@@ -453,7 +456,8 @@ class USPLPPO(PPO):
         # A compiled function cannot be saved, but torch remembers what it has compiled: asking again is cheap.
         forward = th.compile(encoder.__call__, dynamic=True) if self.encoder_compile else encoder
         metrics = []
-        batches = episodes.batches(self._count_encoder_updates(episodes), self.encoder_batch_size, self.device)
+        window = self.encoder_window if self.progress == 0.0 else None
+        batches = episodes.batches(self._count_encoder_updates(episodes), self.encoder_batch_size, self.device, window)
         for update, (tokens, truth, lengths) in enumerate(batches):
             if update == 0:
                 encoder.features.update_normalizers(tokens)

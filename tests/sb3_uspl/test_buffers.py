@@ -64,6 +64,21 @@ def test_batches_are_whole_episodes_one_after_another():
     assert len({tuple(batch.tokens["common"][:, 0].tolist()) for batch in batches}) > 1
 
 
+@pytest.mark.parametrize("window", [1, 4])
+def test_windows_are_decisions_in_a_row_from_anywhere_in_an_episode(window):
+    episodes = make_episodes()
+    fill(episodes, [3, 5, 9, 7], 20)
+    stored = {(e.arrays["truth"][0, 0], *e.arrays["common"][i : i + window, 0]) for e in episodes.fresh for i in range(9)}
+    stored = {piece for piece in stored if len(piece) == 1 + window}
+    seen = set()
+    for batch in episodes.batches(5 * EpisodeReplayBuffer.STAGED_BATCHES, 50, window=window):
+        lengths = batch.lengths.tolist()
+        assert max(lengths) == window and 50 <= sum(lengths) == len(batch.truth) < 50 + window
+        for truth, common in zip(batch.truth.split(lengths), batch.tokens["common"].split(lengths), strict=True):
+            seen |= {(truth[0, 0].item(), *common[:, 0].tolist())} if len(common) == window else set()
+    assert seen == stored
+
+
 def test_half_of_a_batch_is_fresh_and_half_replayed():
     episodes = make_episodes(keep="all")
     fill(episodes, [5] * 4, 21)

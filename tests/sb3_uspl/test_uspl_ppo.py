@@ -468,6 +468,20 @@ def test_wander_actions_of_discrete_actions_are_refused():
         make_model(wander_share=0.5, wander_actions={0: 0.0}, env_kwargs=dict(action_space=spaces.Discrete(3)))
 
 
+def test_the_encoder_learns_from_windows_during_the_warm_up_and_from_whole_episodes_after():
+    model = make_model(encoder_window=2, warmup_timesteps=3 * 128, ramp_timesteps=0)
+    longest, batches = [], model.rollout_buffer.episodes.batches
+
+    def watched(*args):
+        for batch in batches(*args):
+            longest.append((model.progress > 0.0, int(batch.lengths.max())))
+            yield batch
+
+    model.rollout_buffer.episodes.batches = watched
+    model.learn(6 * 128)
+    assert set(longest) == {(False, 2), (True, 8)}
+
+
 def test_a_policy_that_starts_anew_after_the_warm_up_keeps_the_encoder():
     venv = make_vec_env(ToyEnv, 8, seed=0)
     kwargs = dict(n_steps=8, batch_size=32, n_epochs=1, seed=0, ramp_timesteps=0, warmup_timesteps=128)
