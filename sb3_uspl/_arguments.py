@@ -57,7 +57,7 @@ def check_arguments(model: "USPLPPO") -> None:
             raise ValueError(
                 f"action_std={model.action_std}: give one positive number, or one for each of the {n_action} action values."
             )
-    check_wander_actions(model.wander_actions, model.action_space)
+    model.wander_actions = checked_wander_actions(model.wander_actions, model.action_space)
     ranges = {
         "warmup_timesteps": (model.warmup_timesteps or 0, 0, np.inf),
         "ramp_timesteps": (model.ramp_timesteps or 0, 0, np.inf),
@@ -82,16 +82,18 @@ def check_arguments(model: "USPLPPO") -> None:
             raise ValueError(f"{name}={value} is outside of its range [{low}, {high}].")
 
 
-def check_wander_actions(chosen: dict[int, float] | None, space: spaces.Space) -> None:
+def checked_wander_actions(chosen: dict[int, float] | None, space: spaces.Space) -> dict[int, float] | None:
     """
-    :param chosen: components of the action and what each is drawn around
+    :param chosen: components of the action and what each is drawn around; as text where a saved model had them as numbers
     :param space: action space
+    :return: the same, as numbers
     :raises ValueError: if the space is not a Box with these components and values
     """
     if chosen is None:
-        return
+        return None
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and isinstance(chosen, dict) and chosen):
         raise ValueError(f"wander_actions={chosen}: a dict {{component: middle}}, for a flat Box action space, not {space}.")
+    chosen = {int(component): float(middle) for component, middle in chosen.items()}
     for component, middle in chosen.items():
         if not (0 <= component < space.shape[0] and space.low[component] <= middle <= space.high[component]):
             raise ValueError(f"wander_actions={chosen}: no component {component} that can be {middle} in {space}.")
