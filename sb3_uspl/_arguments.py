@@ -97,6 +97,7 @@ def checked_wander_actions(chosen: dict[int, float] | None, space: spaces.Space)
     for component, middle in chosen.items():
         if not (0 <= component < space.shape[0] and space.low[component] <= middle <= space.high[component]):
             raise ValueError(f"wander_actions={chosen}: no component {component} that can be {middle} in {space}.")
+    return chosen
 
 
 def count_mismatched(fraction: float | None, n_envs: int) -> int:

@@ -463,6 +463,12 @@ def test_wander_actions_that_the_action_space_does_not_hold_are_refused(chosen):
         make_model(wander_share=0.5, wander_actions=chosen)
 
 
+def test_wander_actions_survive_saving(tmp_path):
+    model = make_model(wander_share=0.5, wander_actions={0: 0.5})
+    model.save(tmp_path / "model")
+    assert USPLPPO.load(tmp_path / "model", env=model.env).wander_actions == {0: 0.5}
+
+
 def test_wander_actions_of_discrete_actions_are_refused():
     with pytest.raises(ValueError, match="flat Box action space"):
         make_model(wander_share=0.5, wander_actions={0: 0.0}, env_kwargs=dict(action_space=spaces.Discrete(3)))
