@@ -100,14 +100,14 @@ def _shade_schedule(axis: Axes, run: pd.DataFrame, label: bool) -> None:
     ramp = rows.loc[rows[_PROGRESS] < 1.0, _STEPS]
     begin, end = warm.max() if len(warm) else 0.0, ramp.max() if len(ramp) else 0.0
     regions = (
-        (0.0, begin, _WARM_UP_COLOUR, " warm-up", 0.0, "left"),
-        (begin, end, _RAMP_COLOUR, "ramp", (begin + end) / 2, "center"),
+        (0.0, begin, _WARM_UP_COLOUR, " warm-up"),
+        (begin, end, _RAMP_COLOUR, "\n ramp"),  # a line lower: both may be narrow
     )
-    for left, right, colour, text, place, alignment in regions:
+    for left, right, colour, text in regions:
         if right > left:
             axis.axvspan(left, right, color=colour, zorder=0, linewidth=0)
             if label:
-                axis.text(place, 1.0, text, transform=axis.get_xaxis_transform(), ha=alignment, va="top", alpha=0.7)
+                axis.text(left, 1.0, text, transform=axis.get_xaxis_transform(), ha="left", va="top", alpha=0.7)
 
 
 def on_map(
