@@ -206,7 +206,7 @@ class EpisodeReplayBuffer:
         only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
         return [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
 
-    def _choose(self, n_tokens: int, window: int | None) -> list[Episode]:
+    def _choose(self, n_tokens: int, window: int | None = None) -> list[Episode]:
         sources = [source for source in (self._eligible_fresh(), self.replay) if source]
         episodes: list[Episode] = []
         for source in sources:

@@ -40,9 +40,9 @@ def test_a_loaded_encoder_is_not_fitted_to_the_first_few_episodes_of_a_new_repla
     asked = []
     draw = EpisodeReplayBuffer.batches
 
-    def count(self, n_batches, n_tokens, device="cpu"):
+    def count(self, n_batches, n_tokens, *args):
         asked.append((n_batches, self.n_decisions // n_tokens))
-        return draw(self, n_batches, n_tokens, device)
+        return draw(self, n_batches, n_tokens, *args)
 
     monkeypatch.setattr(EpisodeReplayBuffer, "batches", count)
     model = make_model(encoder_batch_size=64, encoder_updates=3, replay="all")
