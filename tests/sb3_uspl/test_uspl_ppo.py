@@ -457,23 +457,6 @@ def test_a_range_of_times_is_two_positive_numbers(name, times):
         USPLPPO("MlpPolicy", venv, n_steps=8, batch_size=16, mismatch_fraction=0.0, **{name: times})
 
 
-@pytest.mark.parametrize("chosen", [{1: 0.0}, {-1: 0.0}, {0: 1.5}, {0: np.nan}, {}, [0]], ids=str)
-def test_wander_actions_that_the_action_space_does_not_hold_are_refused(chosen):
-    with pytest.raises(ValueError, match="wander_actions="):
-        make_model(wander_share=0.5, wander_actions=chosen)
-
-
-def test_wander_actions_survive_saving(tmp_path):
-    model = make_model(wander_share=0.5, wander_actions={0: 0.5})
-    model.save(tmp_path / "model")
-    assert USPLPPO.load(tmp_path / "model", env=model.env).wander_actions == {0: 0.5}
-
-
-def test_wander_actions_of_discrete_actions_are_refused():
-    with pytest.raises(ValueError, match="flat Box action space"):
-        make_model(wander_share=0.5, wander_actions={0: 0.0}, env_kwargs=dict(action_space=spaces.Discrete(3)))
-
-
 def test_the_encoder_learns_from_windows_during_the_warm_up_and_from_whole_episodes_after():
     model = make_model(encoder_window=2, warmup_timesteps=3 * 128, ramp_timesteps=0)
     longest, batches = [], model.rollout_buffer.episodes.batches
