@@ -225,7 +225,8 @@ print("the other experiments:", ", ".join(name for name in plan.experiments if n
 # trained, `--no-train` shows what there is:
 
 # %%
-with tempfile.TemporaryDirectory() as folder:
+with tempfile.TemporaryDirectory(dir=".") as temporary:
+    folder = Path(temporary).name
     asked = ["table1", "--envs", "LateralChoice-v0", "--seeds", "1", "2", "3", "--no-train", "--output", folder]
     experiments([*asked, "--logs", folder])
     print(sorted(path.name for path in Path(folder).rglob("table1*")))

@@ -173,9 +173,9 @@ class EpisodeReplayBuffer:
         self, n_batches: int, n_tokens: int, device: th.device | str = "cpu", window: int | None = None
     ) -> Generator[EpisodeBatch, None, None]:
         """
-        Draw whole episodes, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one if the other is
-        empty. Nothing comes before the first episode has ended. Episodes with images are drawn whole, too: what they show has
-        to be remembered until the end, so ``n_tokens`` bounds what the CNN has to see.
+        Draw whole episodes or windows of them, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one
+        if the other is empty. Nothing comes before the first episode has ended. Without a ``window``, episodes with images are
+        drawn whole, too: what they show has to be remembered until the end, so ``n_tokens`` bounds what the CNN has to see.
 
         Tokens go to the device once for every ``STAGED_BATCHES`` batches, which are then put together there.
 
