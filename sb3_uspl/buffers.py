@@ -170,11 +170,16 @@ class EpisodeReplayBuffer:
         return sum(map(len, (*self._eligible_fresh(), *self.replay)))
 
     def batches(
-        self, n_batches: int, n_tokens: int, device: th.device | str = "cpu", window: int | None = None
+        self,
+        n_batches: int,
+        n_tokens: int,
+        device: th.device | str = "cpu",
+        fresh_window: int | None = None,
+        replay_window: int | None = None,
     ) -> Generator[EpisodeBatch, None, None]:
         """
         Draw whole episodes or windows of them, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one
-        if the other is empty. Nothing comes before the first episode has ended. Without a ``window``, episodes with images are
+        if the other is empty. Nothing comes before the first episode has ended. Without a window, episodes with images are
         drawn whole, too: what they show has to be remembered until the end, so ``n_tokens`` bounds what the CNN has to see.
 
         Tokens go to the device once for every ``STAGED_BATCHES`` batches, which are then put together there.
@@ -182,11 +187,13 @@ class EpisodeReplayBuffer:
         :param n_batches: number of batches
         :param n_tokens: about how many decisions in each
         :param device: of the tensors
-        :param window: decisions in a row that are drawn of an episode, from anywhere in it; None: all. Episodes are as likely
-            as each other whatever their length.
+        :param fresh_window: decisions in a row that are drawn of an episode of this iteration, from anywhere in it; None: all.
+            Episodes are as likely as each other whatever their length.
+        :param replay_window: the same for replayed episodes
         """
         for first in range(0, n_batches, self.STAGED_BATCHES):
-            chosen = [self._choose(n_tokens, window) for _ in range(first, min(first + self.STAGED_BATCHES, n_batches))]
+            count = min(self.STAGED_BATCHES, n_batches - first)
+            chosen = [self._choose(n_tokens, fresh_window, replay_window) for _ in range(count)]
             if not chosen[0]:
                 return
             unique = list({id(episode): episode for episodes in chosen for episode in episodes}.values())
@@ -206,10 +213,14 @@ class EpisodeReplayBuffer:
         only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
         return [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
 
-    def _choose(self, n_tokens: int, window: int | None = None) -> list[Episode]:
-        sources = [source for source in (self._eligible_fresh(), self.replay) if source]
+    def _choose(self, n_tokens: int, fresh_window: int | None = None, replay_window: int | None = None) -> list[Episode]:
+        sources = [
+            (source, window)
+            for source, window in ((self._eligible_fresh(), fresh_window), (self.replay, replay_window))
+            if source
+        ]
         episodes: list[Episode] = []
-        for source in sources:
+        for source, window in sources:
             count = 0
             while count < n_tokens / len(sources):
                 episode = source[int(self.rng.integers(len(source)))]

@@ -153,11 +153,15 @@ class USPLPolicy(ActorCriticPolicy):
     :param bounded_mean: whether the mean of continuous actions is squashed into the action space by a tanh, as in the authors'
         release, with the gradient of ``recoverable_tanh``. Without it the mean drifts beyond the bounds, where sampling
         changes nothing any more and a habit of the warm-up cannot be unlearned.
+    :param initial_action: mean of continuous actions before any training, in units of the action space, inside its bounds. A
+        robot that looks down from the beginning shows its encoder what is to be seen there. None: the middle of the action
+        space, or 0 without ``bounded_mean``.
     :param noise_correlation: of the noise of continuous actions from one decision to the next, see
         ``CorrelatedGaussianDistribution``
     :param smoothing: share of the old uncertainty that survives a decision (App. C.3.1)
     :param kwargs: further arguments of ``ActorCriticPolicy``
-    :raises ValueError: for a space outside the contract, an unknown preset, or ``one_hot`` without discrete dimensions
+    :raises ValueError: for a space outside the contract, an unknown preset, ``one_hot`` without discrete dimensions, or an
+        ``initial_action`` that the action space does not hold
     """
 
     def __init__(
@@ -180,6 +184,7 @@ class USPLPolicy(ActorCriticPolicy):
         normalize_common: bool = True,
         one_hot: bool = False,
         bounded_mean: bool = True,
+        initial_action: Sequence[float] | None = None,
         noise_correlation: float = 0.0,
         smoothing: float = 0.0,
         **kwargs: Any,
@@ -198,6 +203,7 @@ class USPLPolicy(ActorCriticPolicy):
             encoder_learning_rate=encoder_learning_rate,
             encoder_weight_decay=encoder_weight_decay,
             bounded_mean=bounded_mean,
+            initial_action=initial_action,
             noise_correlation=noise_correlation,
             smoothing=smoothing,
         )
@@ -229,6 +235,9 @@ class USPLPolicy(ActorCriticPolicy):
             self.action_half_range: th.Tensor
             self.register_buffer("action_centre", 0.5 * (high + low).flatten())
             self.register_buffer("action_half_range", 0.5 * (high - low).flatten())
+        self.initial_action = initial_action
+        if initial_action is not None:
+            self._begin_with(initial_action)
         if noise_correlation > 0.0 and isinstance(action_space, spaces.Box):
             self.action_dist = CorrelatedGaussianDistribution(get_flattened_obs_dim(action_space), noise_correlation)
         # Built after super().__init__, whose optimizer must not hold the encoder.
@@ -271,6 +280,27 @@ class USPLPolicy(ActorCriticPolicy):
         assert isinstance(obs, dict)
         return {key: obs[key] for key in POLICY_KEYS}
 
+    def _begin_with(self, action: Sequence[float]) -> None:
+        """Choose the bias of an untrained actor so that its mean action is the given one."""
+        space = self.action_space
+        given = np.asarray(action, dtype=np.float32)
+        if not (
+            isinstance(space, spaces.Box)
+            and given.shape == space.shape
+            and (space.low < given).all()
+            and (given < space.high).all()
+        ):
+            raise ValueError(
+                f"`initial_action` must be of the shape of a Box action space and inside its bounds, got {list(action)} for "
+                f"{space}."
+            )
+        bias = th.as_tensor(given.flatten(), device=self.device)
+        if self.bounded_mean:
+            bias = th.atanh((bias - self.action_centre) / self.action_half_range)
+        assert isinstance(self.action_net, nn.Linear)
+        with th.no_grad():
+            self.action_net.bias.copy_(bias)
+
     def update_normalizers(self, common: np.ndarray) -> None:
         """
         Let actor and critic know more common observations; between PPO's updates only, which compare old and new policy.
@@ -290,6 +320,8 @@ class USPLPolicy(ActorCriticPolicy):
         encoder = self.encoder
         del self.encoder  # the optimizer of actor and critic must not hold it
         self._build(lr_schedule)
+        if self.initial_action is not None:
+            self._begin_with(self.initial_action)
         self.encoder = encoder
         self.to(self.device)
 

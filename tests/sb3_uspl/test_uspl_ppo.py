@@ -469,29 +469,3 @@ def test_the_encoder_learns_from_windows_during_the_warm_up_and_from_whole_episo
     model.rollout_buffer.episodes.batches = watched
     model.learn(6 * 128)
     assert set(longest) == {(False, 2), (True, 8)}
-
-
-def test_a_policy_that_starts_anew_after_the_warm_up_keeps_the_encoder():
-    venv = make_vec_env(ToyEnv, 8, seed=0)
-    kwargs = dict(n_steps=8, batch_size=32, n_epochs=1, seed=0, ramp_timesteps=0, warmup_timesteps=128)
-    before = {}
-
-    class Watch(BaseCallback):
-        def _on_step(self):
-            return True
-
-        def _on_rollout_end(self):
-            policy = self.model.policy
-            actor, encoder = policy.action_net.weight.detach().clone(), policy.encoder.mean[-1].weight.detach().clone()
-            before[self.num_timesteps] = (actor, encoder, policy.pi_features_extractor.common_normalizer.count.item())
-
-    model = USPLPPO("MlpPolicy", venv, policy_restart=True, learning_rate=0.0, encoder_updates=0, **kwargs)
-    model.learn(256, callback=Watch())
-    assert list(before) == [64, 128, 192, 256]
-    for (earlier, later), same in zip(itertools.pairwise(before), (True, False, True), strict=True):
-        assert th.equal(before[earlier][0], before[later][0]) == same
-        assert th.equal(before[earlier][1], before[later][1])
-        assert before[earlier][2] < before[later][2]
-    held = {id(parameter) for group in model.policy.optimizer.param_groups for parameter in group["params"]}
-    assert id(model.policy.action_net.weight) in held
-    assert not held & {id(parameter) for parameter in model.policy.encoder.parameters()}
