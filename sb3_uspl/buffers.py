@@ -1,5 +1,6 @@
 """Where experience lives: PPO's rollout buffer, and the episodes that the observation encoder learns from."""
 
+import math
 from collections import deque
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -43,12 +44,17 @@ class Episode:
     def __len__(self) -> int:
         return len(self.arrays[TRUTH])
 
-    def __getitem__(self, decisions: slice) -> "Episode":
+    def __getitem__(self, decisions: np.ndarray) -> "Episode":
         return Episode({key: array[decisions] for key, array in self.arrays.items()}, self.mismatched)
 
     @property
     def nbytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values())
+
+
+def _ranges(firsts: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Whole numbers from each first one on, as many as its size, one after another."""
+    return np.repeat(firsts - (np.cumsum(sizes) - sizes), sizes) + np.arange(sizes.sum())
 
 
 class EpisodeBatch(NamedTuple):
@@ -191,45 +197,56 @@ class EpisodeReplayBuffer:
             Episodes are as likely as each other whatever their length.
         :param replay_window: the same for replayed episodes
         """
+        fresh = self._eligible_fresh()
+        episodes = [*fresh, *self.replay]
+        lengths = np.array([len(episode) for episode in episodes], dtype=np.int64)
+        starts = np.cumsum(lengths) - lengths  # of the episodes, if the decisions of all of them lay one after another
+        ranges = ((0, len(fresh), fresh_window), (len(fresh), len(episodes), replay_window))
+        sources = [(np.arange(low, high), window) for low, high, window in ranges if low < high]
+        if not sources:
+            return
         for first in range(0, n_batches, self.STAGED_BATCHES):
             count = min(self.STAGED_BATCHES, n_batches - first)
-            chosen = [self._choose(n_tokens, fresh_window, replay_window) for _ in range(count)]
-            if not chosen[0]:
-                return
-            unique = list({id(episode): episode for episodes in chosen for episode in episodes}.values())
-            starts = dict(zip(map(id, unique), np.cumsum([0, *map(len, unique)]).tolist(), strict=False))
-            staged = self.collate(unique, device)
-            lengths = [np.array([len(episode) for episode in episodes]) for episodes in chosen]
-            places = [
-                np.concatenate([np.arange(starts[id(episode)], starts[id(episode)] + len(episode)) for episode in episodes])
-                for episodes in chosen
-            ]
-            all_lengths = th.as_tensor(np.concatenate(lengths), device=device).split([len(part) for part in lengths])
-            all_places = th.as_tensor(np.concatenate(places), device=device).split([len(part) for part in places])
-            for place, length in zip(all_places, all_lengths, strict=True):
-                yield EpisodeBatch({key: value[place] for key, value in staged.tokens.items()}, staged.truth[place], length)
+            pieces = [self._choose(sources, starts, lengths, n_tokens) for _ in range(count)]
+            decisions = np.concatenate([_ranges(*piece) for piece in pieces])
+            unique, places = np.unique(decisions, return_inverse=True)
+            staged = self._gather(episodes, starts, unique, device)
+            sizes = th.as_tensor(np.concatenate([size for _, size in pieces]), device=device)
+            all_places = th.as_tensor(places, device=device).split([int(size.sum()) for _, size in pieces])
+            for place, size in zip(all_places, sizes.split([len(size) for _, size in pieces]), strict=True):
+                yield EpisodeBatch({key: value[place] for key, value in staged.tokens.items()}, staged.truth[place], size)
 
     def _eligible_fresh(self) -> list[Episode]:
         only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
         return [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
 
-    def _choose(self, n_tokens: int, fresh_window: int | None = None, replay_window: int | None = None) -> list[Episode]:
-        sources = [
-            (source, window)
-            for source, window in ((self._eligible_fresh(), fresh_window), (self.replay, replay_window))
-            if source
+    def _choose(
+        self, sources: list[tuple[np.ndarray, int | None]], starts: np.ndarray, lengths: np.ndarray, n_tokens: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """First decisions and lengths of a batch's pieces, an equal share of the tokens from each source."""
+        firsts, sizes = [], []
+        for rows, window in sources:
+            share = n_tokens / len(sources)
+            drawn = self.rng.choice(rows, math.ceil(share))  # enough if every episode had a single decision
+            size = lengths[drawn] if window is None else np.minimum(lengths[drawn], window)
+            enough = int(np.searchsorted(np.cumsum(size), share)) + 1
+            drawn, size = drawn[:enough], size[:enough]
+            firsts.append(starts[drawn] + self.rng.integers(lengths[drawn] - size + 1))
+            sizes.append(size)
+        return np.concatenate(firsts), np.concatenate(sizes)
+
+    def _gather(
+        self, episodes: Sequence[Episode], starts: np.ndarray, decisions: np.ndarray, device: th.device | str
+    ) -> EpisodeBatch:
+        """Single decisions, in rising order, of episodes that begin at ``starts``; those of an episode are a part of it."""
+        owners, firsts, counts = np.unique(
+            np.searchsorted(starts, decisions, side="right") - 1, return_index=True, return_counts=True
+        )
+        parts = [
+            episodes[owner][decisions[first : first + count] - starts[owner]]
+            for owner, first, count in zip(owners.tolist(), firsts.tolist(), counts.tolist(), strict=True)
         ]
-        episodes: list[Episode] = []
-        for source, window in sources:
-            count = 0
-            while count < n_tokens / len(sources):
-                episode = source[int(self.rng.integers(len(source)))]
-                if window is not None and len(episode) > window:
-                    first = int(self.rng.integers(len(episode) - window + 1))
-                    episode = episode[first : first + window]
-                episodes.append(episode)
-                count += len(episode)
-        return episodes
+        return self.collate(parts, device)
 
     def running_tokens(self, device: th.device | str = "cpu") -> tuple[Tokens, th.Tensor]:
         """

@@ -39,7 +39,7 @@ def mlp(n_inputs: int, hidden: Sequence[int]) -> nn.Sequential:
     """
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(n_inputs, width), nn.ELU()]
+        layers += [nn.Linear(n_inputs, width), nn.ELU(inplace=True)]  # in place, its gradient needs no exponential
         n_inputs = width
     return nn.Sequential(*layers)
 
@@ -173,7 +173,7 @@ class ImageCNN(nn.Module):
         for channels, kernel, stride, pooling in convolutions:
             layers.append(nn.Conv2d(n_channels, channels, kernel, stride))
             layers += [nn.MaxPool2d(pooling)] if pooling > 1 else []
-            layers.append(nn.ELU())
+            layers.append(nn.ELU(inplace=True))
             height, width = (((size - kernel) // stride + 1) // pooling for size in (height, width))
             n_channels = channels
         # Channels last is the faster way round for oneDNN's convolutions of gray images.
@@ -192,7 +192,7 @@ class ImageCNN(nn.Module):
             self.scan_normalizer.update(column_scan(self._pixels(images)))
 
     def _pixels(self, images: th.Tensor) -> th.Tensor:
-        pixels = images.to(th.float32, copy=True, memory_format=th.channels_last)
+        pixels = images.float()  # several times as fast as a copy into another memory format
         return pixels.mul_(1.0 / self.range).sub_(self.low / self.range + 0.5)  # in place: the largest tensor that there is
 
     def forward(self, images: th.Tensor) -> th.Tensor:
@@ -201,7 +201,8 @@ class ImageCNN(nn.Module):
         :return: ``(n, width)``
         """
         pixels = self._pixels(images)
-        features = self.fully_connected(self.convolutions(pixels).permute(0, 2, 3, 1).flatten(1))
+        convolved = self.convolutions(pixels.contiguous(memory_format=th.channels_last))
+        features = self.fully_connected(convolved.permute(0, 2, 3, 1).flatten(1))
         if self.scan_normalizer is None:
             return features
         return th.cat((features, self.scan(self.scan_normalizer(column_scan(pixels)))), dim=1)
