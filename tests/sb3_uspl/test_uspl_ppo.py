@@ -56,7 +56,12 @@ def test_with_everything_off_it_is_stock_ppo(action_space):
         mismatch_fraction=0.0,
         encoder_batch_size=64,
         policy_kwargs=dict(
-            net_arch=[32], activation_fn=th.nn.Tanh, privileged_gain=1.0, normalize_common=False, bounded_mean=False
+            net_arch=[32],
+            activation_fn=th.nn.Tanh,
+            privileged_gain=1.0,
+            normalize_common=False,
+            bounded_mean=False,
+            optimizer_kwargs=dict(fused=False),
         ),
         **common,
     )
