@@ -163,10 +163,18 @@ class MaxMemory(Memory):
         return (th.zeros(n_envs, self.n_features, device=self.out.weight.device),)
 
     def _remember(self, features: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
-        mask = token_mask(lengths)
         # Zero is where every memory begins, so nothing below it is noticed.
-        largest = th.cummax(_padded(F.relu(self.notice(features)), mask), dim=1).values
-        return self._output(largest[mask], features), (largest[:, -1].detach(),)
+        noticed = F.relu(self.notice(features))
+        largest = noticed.clone()
+        # Sequences of about the same length together: a table of single decisions and long episodes would be nearly all padding.
+        octave = (lengths.clamp(min=1) - 1).float().log2().floor()  # minus infinity for sequences of one token
+        of_token = octave.repeat_interleave(lengths)
+        for group in octave.unique().tolist():
+            if group >= 0.0:
+                tokens, mask = of_token == group, token_mask(lengths[octave == group])
+                largest[tokens] = th.cummax(_padded(noticed[tokens], mask), dim=1).values[mask]
+        last = largest.detach()[(lengths.cumsum(0) - 1).clamp(min=0)]
+        return self._output(largest, features), (th.where(lengths[:, None] > 0, last, th.zeros_like(last)),)
 
     def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
         largest = th.maximum(F.relu(self.notice(features)), state[0])

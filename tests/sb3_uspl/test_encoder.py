@@ -53,7 +53,7 @@ def test_steps_equal_whole_episodes_across_resets_and_cache_growth(name):
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_sequences_do_not_reach_into_each_other(name):
-    memory, lengths = make_memory(name), th.tensor([3, 0, 7, 1, 7])
+    memory, lengths = make_memory(name), th.tensor([3, 0, 7, 1, 2, 17, 16, 7])
     features = th.randn(int(lengths.sum()), 16)
     with th.no_grad():
         together, _ = memory(features, lengths)
