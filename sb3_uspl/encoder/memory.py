@@ -166,7 +166,7 @@ class MaxMemory(Memory):
         # Zero is where every memory begins, so nothing below it is noticed.
         noticed = F.relu(self.notice(features))
         largest = noticed.clone()
-        # Sequences of about the same length together: a table of single decisions and long episodes would be nearly all padding.
+        # Sequences of about the same length together: a table of single decisions and long episodes would be mostly padding.
         octave = (lengths.clamp(min=1) - 1).float().log2().floor()  # minus infinity for sequences of one token
         of_token = octave.repeat_interleave(lengths)
         for group in octave.unique().tolist():
