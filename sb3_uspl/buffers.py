@@ -180,26 +180,28 @@ class EpisodeReplayBuffer:
         n_batches: int,
         n_tokens: int,
         device: th.device | str = "cpu",
+        fresh_window: int | None = None,
         replay_window: int | None = None,
     ) -> Generator[EpisodeBatch, None, None]:
         """
-        Draw whole episodes, or windows of replayed ones, half of the tokens from this iteration, half replayed (Sec. 3.2); all
-        from one if the other is empty. Nothing comes before the first episode has ended. Episodes with images are drawn whole,
-        too: what they show has to be remembered until the end, so ``n_tokens`` bounds what the CNN has to see.
+        Draw whole episodes or windows of them, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one
+        if the other is empty. Nothing comes before the first episode has ended. Without a window, episodes with images are
+        drawn whole, too: what they show has to be remembered until the end, so ``n_tokens`` bounds what the CNN has to see.
 
         Tokens go to the device once for every ``STAGED_BATCHES`` batches, which are then put together there.
 
         :param n_batches: number of batches
         :param n_tokens: about how many decisions in each
         :param device: of the tensors
-        :param replay_window: decisions in a row that are drawn of a replayed episode, from anywhere in it; None: all. Episodes
-            are as likely as each other whatever their length.
+        :param fresh_window: decisions in a row that are drawn of an episode of this iteration, from anywhere in it; None: all.
+            Episodes are as likely as each other whatever their length.
+        :param replay_window: the same for replayed episodes
         """
         fresh = self._eligible_fresh()
         episodes = [*fresh, *self.replay]
         lengths = np.array([len(episode) for episode in episodes], dtype=np.int64)
         starts = np.cumsum(lengths) - lengths  # of the episodes, if the decisions of all of them lay one after another
-        ranges = ((0, len(fresh), None), (len(fresh), len(episodes), replay_window))
+        ranges = ((0, len(fresh), fresh_window), (len(fresh), len(episodes), replay_window))
         sources = [(np.arange(low, high), window) for low, high, window in ranges if low < high]
         if not sources:
             return

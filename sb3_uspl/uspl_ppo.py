@@ -115,9 +115,9 @@ class USPLPPO(PPO):
     :param encoder_max_grad_norm: gradient clipping of the encoder
     :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1 as it stands
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
-    :param encoder_window: decisions in a row, from anywhere in a replayed episode, that the encoder learns from instead of the
-        whole, where one image that tells something is lost among the many of its episode (1: single ones). Fresh episodes
-        are always whole: the encoder has to remember, too. None: whole episodes only.
+    :param encoder_window: decisions in a row, from anywhere in an episode, that the encoder learns from where one image that
+        tells something is lost among the many of its episode (1: single ones): during the warm-up always, afterwards of
+        replayed episodes, while fresh ones are whole; None: whole episodes
     :param encoder_bf16: whether the encoder's update computes in bfloat16 where torch's autocast deems it safe; for GPUs
     :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; takes minutes at the start, meant
         for the "paper" preset on a GPU
@@ -457,8 +457,9 @@ class USPLPPO(PPO):
         # A compiled function cannot be saved, but torch remembers what it has compiled: asking again is cheap.
         forward = th.compile(encoder.__call__, dynamic=True) if self.encoder_compile else encoder
         metrics = []
+        fresh_window = self.encoder_window if self.progress == 0.0 else None
         n_updates, n_tokens = self._count_encoder_updates(episodes), self.encoder_batch_size
-        batches = episodes.batches(n_updates, n_tokens, self.device, self.encoder_window)
+        batches = episodes.batches(n_updates, n_tokens, self.device, fresh_window, self.encoder_window)
         for update, (tokens, truth, lengths) in enumerate(batches):
             if update == 0:
                 encoder.features.update_normalizers(tokens)

@@ -66,13 +66,12 @@ def test_batches_are_whole_episodes_one_after_another():
 
 @pytest.mark.parametrize("window", [1, 4])
 def test_windows_are_decisions_in_a_row_from_anywhere_in_an_episode(window):
-    episodes = make_episodes(keep="all")
+    episodes = make_episodes()
     fill(episodes, [3, 5, 9, 7], 20)
     stored = {(e.arrays["truth"][0, 0], *e.arrays["common"][i : i + window, 0]) for e in episodes.fresh for i in range(9)}
-    episodes.end_iteration()
     stored = {piece for piece in stored if len(piece) == 1 + window}
     seen = set()
-    for batch in episodes.batches(5 * EpisodeReplayBuffer.STAGED_BATCHES, 50, replay_window=window):
+    for batch in episodes.batches(5 * EpisodeReplayBuffer.STAGED_BATCHES, 50, fresh_window=window):
         lengths = batch.lengths.tolist()
         assert max(lengths) == window and 50 <= sum(lengths) == len(batch.truth) < 50 + window
         for truth, common in zip(batch.truth.split(lengths), batch.tokens["common"].split(lengths), strict=True):

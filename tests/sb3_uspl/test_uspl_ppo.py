@@ -462,15 +462,15 @@ def test_a_range_of_times_is_two_positive_numbers(name, times):
         USPLPPO("MlpPolicy", venv, n_steps=8, batch_size=16, mismatch_fraction=0.0, **{name: times})
 
 
-def test_the_encoder_learns_from_windows_of_replayed_episodes_and_from_whole_fresh_ones():
-    model = make_model(encoder_window=2)
-    lengths, batches = [], model.rollout_buffer.episodes.batches
+def test_the_encoder_learns_from_windows_during_the_warm_up_and_from_whole_episodes_after():
+    model = make_model(encoder_window=2, warmup_timesteps=3 * 128, ramp_timesteps=0)
+    longest, batches = [], model.rollout_buffer.episodes.batches
 
     def watched(*args):
         for batch in batches(*args):
-            lengths.append(set(batch.lengths.tolist()))
+            longest.append((model.progress > 0.0, int(batch.lengths.max())))
             yield batch
 
     model.rollout_buffer.episodes.batches = watched
-    model.learn(3 * 128)
-    assert lengths[0] == {8} and lengths[-1] == {2, 8}
+    model.learn(6 * 128)
+    assert set(longest) == {(False, 2), (True, 8)}
