@@ -35,6 +35,16 @@ def fill(episodes, lengths, n_steps, target=None):
         episodes.add(observation([t % length for length in lengths], t, target))
 
 
+def replayed_and_fresh():
+    """As many replayed episodes as fresh ones, of five decisions each; values of fresh ones are 20 and more."""
+    episodes = make_episodes(keep="all")
+    fill(episodes, [5] * 4, 21)
+    episodes.end_iteration()
+    for t in range(21, 42):
+        episodes.add(observation([t % 5] * 4, t))
+    return episodes
+
+
 def test_episodes_come_out_as_they_went_in():
     episodes = make_episodes(target=IMAGE)
     fill(episodes, [3, 5, 80, 7], 81, IMAGE)  # 80: the running arrays have to grow
@@ -80,11 +90,7 @@ def test_windows_are_decisions_in_a_row_from_anywhere_in_an_episode(window):
 
 
 def test_windows_of_replayed_episodes_leave_fresh_ones_whole():
-    episodes = make_episodes(keep="all")
-    fill(episodes, [5] * 4, 21)
-    episodes.end_iteration()
-    for t in range(21, 42):
-        episodes.add(observation([t % 5] * 4, t))
+    episodes = replayed_and_fresh()
     (batch,) = episodes.batches(1, 1000, replay_window=1)
     firsts = [common[0, 0].item() for common in batch.tokens["common"].split(batch.lengths.tolist())]
     assert {(length, first >= 20) for length, first in zip(batch.lengths.tolist(), firsts, strict=True)} == {
@@ -94,11 +100,7 @@ def test_windows_of_replayed_episodes_leave_fresh_ones_whole():
 
 
 def test_half_of_a_batch_is_fresh_and_half_replayed():
-    episodes = make_episodes(keep="all")
-    fill(episodes, [5] * 4, 21)
-    episodes.end_iteration()
-    for t in range(21, 42):
-        episodes.add(observation([t % 5] * 4, t))
+    episodes = replayed_and_fresh()
     (batch,) = episodes.batches(1, 10_000)
     first_value = batch.tokens["common"][::5, 0]
     assert ((first_value >= 20).float().mean() - 0.5).abs() < 0.05
