@@ -210,7 +210,8 @@ class Grid:
         training = [job for job in self.running if job.phase == "train"]
         now = {job.folder.cell.name: max(job.folder.decisions(), job.first) for job in training}
         left = sum(folder.cell.timesteps for folder in self.waiting)
-        left += sum(job.folder.cell.timesteps - now[job.folder.cell.name] for job in training)
+        # The last rollout goes past the end.
+        left += sum(max(job.folder.cell.timesteps - now[job.folder.cell.name], 0) for job in training)
         gone = self._trained_decisions + sum(now[job.folder.cell.name] - job.first for job in training)
         elapsed = time.monotonic() - self._begin
         measuring = sum(self._measuring_times) / max(len(self._measuring_times), 1)
