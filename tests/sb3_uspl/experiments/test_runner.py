@@ -45,8 +45,8 @@ class FakeMachine:
         if event == "interrupt":
             raise KeyboardInterrupt
         if event != "refuse":
-            self._work(arguments, 0.5 if event in ("half", "hang") else 1.0)
-        child = FakeChild({"half": 1, "refuse": 1, "hang": None}.get(event, 0))
+            self._work(arguments, {"half": 0.5, "hang": 0.5, "late": 1.1}.get(event, 1.0))
+        child = FakeChild({"half": 1, "refuse": 1, "hang": None, "late": None}.get(event, 0))
         self.children.append(child)
         return child
 
@@ -196,6 +196,22 @@ def test_ctrl_c_ends_the_children_and_keeps_their_wall_times(tmp_path, cells):
     for cell in cells[:2]:
         state = CellFolder(tmp_path / "logs", cell).state
         assert len(state["wall_times"]) == 1 and not state["trained"]
+
+
+def test_no_time_is_left_where_the_last_rollout_goes_past_the_end(tmp_path, cells, capsys):
+    grid = Grid(cells[:1], tmp_path / "logs", Results(tmp_path / "raw"), 1, FakeMachine({0: "late"}))
+    report = grid._report
+
+    def report_and_press(*_):
+        grid._begin -= 1000.0  # s
+        report()
+        raise KeyboardInterrupt
+
+    grid._report = report_and_press
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("sb3_uspl.experiments.runner.REPORT_PERIOD", 0.0)
+        grid.run()
+    assert "about 0:00:00 left" in capsys.readouterr().out
 
 
 def test_no_more_children_than_jobs(tmp_path, cells):
