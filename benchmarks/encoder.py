@@ -12,7 +12,8 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from torch import nn
 from torch.nn.utils.rnn import pad_sequence
 
-from benchmarks.harness import TARGETS, Row, Tables, interleave, ratio, rows, target, torch_threads
+from benchmarks.harness import TARGETS, Row, Tables, interleave, ratio, rows, target
+from sb3_uspl._threads import torch_threads
 from sb3_uspl.encoder import MEMORIES, Belief, ObservationEncoder, Tokens, gaussian_nll, take_rows
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED
 

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.contenders import build, make_venv
-from benchmarks.harness import Row, Tables, interleave, rows, torch_threads
+from benchmarks.harness import Row, Tables, interleave, rows
 from benchmarks.phases import POLICY, watch_rollouts
 from benchmarks.synthetic import SyntheticEnv
 from benchmarks.training import ALL_AT_ONCE, iteration_seconds
 from sb3_uspl import USPLPPO
+from sb3_uspl._threads import torch_threads
 from sb3_uspl.encoder import MEMORIES
 
 PASSES = 4

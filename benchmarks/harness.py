@@ -1,13 +1,10 @@
 """What every benchmark shares: interleaved repetitions, rows and targets, threads, and how results are shown and kept."""
 
-import contextlib
 import json
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import torch as th
 
 Row = dict[str, Any]
 """One line of a table: column -> text, number, truth value or None."""
@@ -86,21 +83,6 @@ def target(what: str, measured: float, at_least: float | None = None, at_most: f
     if at_most is not None:
         return {"what": what, "measured": measured, "target": f"<= {at_most:g}", "met": measured <= at_most}
     return {"what": what, "measured": measured, "target": f">= {at_least:g}", "met": measured >= at_least}  # type: ignore[operator]
-
-
-@contextlib.contextmanager
-def torch_threads(n_threads: int) -> Iterator[None]:
-    """
-    Compute with a number of threads; two on busy cores are ten times slower than one, as they wait by spinning.
-
-    :param n_threads: within torch operations
-    """
-    before = th.get_num_threads()
-    th.set_num_threads(n_threads)
-    try:
-        yield
-    finally:
-        th.set_num_threads(before)
 
 
 def show(title: str, table: Sequence[Row], markdown: bool = False) -> str:

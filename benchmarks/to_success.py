@@ -19,9 +19,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.contenders import build, hides_privileged, make_venv, zoo_entry, zoo_settings
-from benchmarks.harness import Row, show, torch_threads, write_json
+from benchmarks.harness import Row, show, write_json
 from benchmarks.machine import ROOT, busy, describe, load
 from benchmarks.training import TASKS, Task
+from sb3_uspl._threads import torch_threads
 from sb3_uspl.evaluation import EVALUATION_SEED, run_episodes, success_rate
 
 METHODS = ("USPLPPO", "RecurrentPPO", "RESeLPPO")

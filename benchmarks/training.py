@@ -26,9 +26,10 @@ from benchmarks.contenders import (
     zoo_entry,
     zoo_settings,
 )
-from benchmarks.harness import TARGETS, Row, Tables, interleave, ratio, rows, target, torch_threads
+from benchmarks.harness import TARGETS, Row, Tables, interleave, ratio, rows, target
 from benchmarks.phases import PHASES, POLICY, watch_phases, watch_rollouts
 from sb3_uspl import USPLPPO
+from sb3_uspl._threads import torch_threads
 
 
 class Task(NamedTuple):

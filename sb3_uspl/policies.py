@@ -1,7 +1,8 @@
 """Policies: actor and critic for PPO, and the observation encoder that turns the actor into the deployment policy."""
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -308,11 +309,22 @@ class USPLPolicy(ActorCriticPolicy):
         """
         Let actor and critic know more common observations; between PPO's updates only, which compare old and new policy.
 
-        :param common: ``(n_samples, n_common)``
+        :param common: ``(..., n_common)``
         """
+        common = common.reshape(-1, common.shape[-1])
         for features in (self.pi_features_extractor, self.vf_features_extractor):
             if isinstance(features.common_normalizer, RunningNormalizer):
                 features.common_normalizer.update(th.as_tensor(common, dtype=th.float32, device=self.device))
+
+    @contextlib.contextmanager
+    def without_encoder(self) -> Iterator[ObservationEncoder]:
+        """Within this context, this module's parameters are those of actor and critic. Yields the encoder."""
+        encoder = self.encoder
+        del self.encoder
+        try:
+            yield encoder
+        finally:
+            self.encoder = encoder
 
     def restart(self, lr_schedule: Schedule) -> None:
         """
@@ -320,12 +332,10 @@ class USPLPolicy(ActorCriticPolicy):
 
         :param lr_schedule: learning rate of actor and critic
         """
-        encoder = self.encoder
-        del self.encoder  # the optimizer of actor and critic must not hold it
-        self._build(lr_schedule)
-        if self.initial_action is not None:
-            self._begin_with(self.initial_action)
-        self.encoder = encoder
+        with self.without_encoder():
+            self._build(lr_schedule)
+            if self.initial_action is not None:
+                self._begin_with(self.initial_action)
         self.to(self.device)
 
     def set_action_std(self, std: float | Sequence[float] | np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """USPL on top of Stable-Baselines3's PPO (Alg. 1)."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -22,8 +23,10 @@ from sb3_uspl._arguments import (
     count_mismatched,
     in_decisions,
 )
+from sb3_uspl._threads import run_side_by_side, torch_threads
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
+from sb3_uspl.encoder import ObservationEncoder
 from sb3_uspl.observations import COMMON
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
@@ -410,12 +413,8 @@ class USPLPPO(PPO):
             correlation = smoothing_factor(self.action_noise_time * (1.0 - fall), self.decision_period)
             self.policy.action_dist.correlation = correlation
         # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.
-        threads = th.get_num_threads()
-        th.set_num_threads(1)
-        try:
+        with torch_threads(1):
             return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
-        finally:
-            th.set_num_threads(threads)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         """Episode statistics of the privileged policy, without the mismatched environments."""
@@ -423,33 +422,35 @@ class USPLPPO(PPO):
         super()._update_info_buffer(infos[:n_matched], None if dones is None else dones[:n_matched])
 
     def train(self) -> None:
-        """PPO's update, then the encoder's (Alg. 1, lines 12 and 13)."""
+        """PPO's update and the encoder's (Alg. 1, lines 12 and 13), side by side where torch has two threads or more."""
         wrapper, episodes = self._rollout_env, self._episodes
         assert wrapper is not None
         untrained = wrapper.progress == 0.0 and not self.policy_warmup
-        if not untrained:
-            super().train()
-        common = self.rollout_buffer.observations[COMMON]
-        self.policy.update_normalizers(common.reshape(-1, common.shape[-1]))
+        # An episode that ended with the rollout's last decision is over, though no observation has been added since.
+        episodes.close_ended(wrapper.step_count)
+        episodes.telltale = wrapper.progress == 0.0 and not untrained
+        encoder_learns = self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0)
+        # PPO clips the gradients of the whole policy; the encoder's must not be among them.
+        with self.policy.without_encoder() as encoder:
+            learners: list[Callable[[], None]] = [] if untrained else [super().train]
+            if encoder_learns:
+                learners.append(functools.partial(self._train_encoder, encoder))
+            run_side_by_side(learners, self.device)
+        self.policy.update_normalizers(self.rollout_buffer.observations[COMMON])
         for name, values in wrapper.metrics.items():
             self.logger.record(f"uspl/{name}", float(np.mean(values)))
         wrapper.metrics.clear()
         self.logger.record("uspl/progress", wrapper.progress)
-        # An episode that ended with the rollout's last decision is over, though no observation has been added since.
-        episodes.close_ended(wrapper.step_count)
-        episodes.telltale = wrapper.progress == 0.0 and not untrained
-        if self.encoder_updates > 0 and (self.encoder_warmup or wrapper.progress > 0.0):
-            self._train_encoder(episodes)
+        if encoder_learns:
             self.policy.encoder.eval()
-            tokens, lengths = episodes.running_tokens(self.device)
-            wrapper.rebuild_memory(tokens, lengths)
+            wrapper.rebuild_memory(*episodes.running_tokens(self.device))
         episodes.end_iteration()
         self.logger.record("encoder/replay_episodes", len(episodes.replay))
         self.logger.record("encoder/replay_fill", episodes.nbytes / episodes.max_bytes)
 
-    def _train_encoder(self, episodes: EpisodeReplayBuffer) -> None:
-        """Maximum likelihood on whole episodes, Eq. 1."""
-        encoder, optimizer = self.policy.encoder, self.policy.encoder_optimizer
+    def _train_encoder(self, encoder: ObservationEncoder) -> None:
+        """Maximum likelihood on whole episodes, Eq. 1. Touches nothing that PPO's update does, which may run beside it."""
+        optimizer, episodes = self.policy.encoder_optimizer, self._episodes
         learning_rate = self.encoder_lr_schedule(self._current_progress_remaining)
         update_learning_rate(optimizer, learning_rate)
         self.logger.record("encoder/learning_rate", learning_rate)
@@ -475,7 +476,6 @@ class USPLPPO(PPO):
                 error = (belief.mean - truth).abs().mean()
                 numbers = (encoder.loss(belief, truth), error, belief.std.mean(), encoder.accuracy(belief, truth))
                 metrics.append(th.stack(numbers))
-        # PPO clips the gradients of the whole policy; the encoder's must not be among them.
         optimizer.zero_grad(set_to_none=True)
         if metrics:
             names = ("nll", "error", "std", "accuracy")

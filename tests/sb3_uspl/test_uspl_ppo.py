@@ -13,6 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_uspl import RMA, USPLPPO, MlpPolicy
+from sb3_uspl._threads import torch_threads
 from tests.sb3_uspl.toy import IMAGE, ToyEnv
 
 FAST = dict(n_steps=16, batch_size=32, n_epochs=2, encoder_updates=2, encoder_batch_size=64, seed=0)
@@ -92,7 +93,6 @@ def test_ppo_and_encoder_never_touch_each_others_weights():
     encoder_ids = {id(parameter) for parameter in model.policy.encoder.parameters()}
     held_by_ppo = {id(parameter) for group in model.policy.optimizer.param_groups for parameter in group["params"]}
     assert not encoder_ids & held_by_ppo
-    # Left-over gradients would enter PPO's clipping of the whole policy.
     assert all(parameter.grad is None for parameter in model.policy.encoder.parameters())
 
     before = parameters(model)
@@ -101,11 +101,38 @@ def test_ppo_and_encoder_never_touch_each_others_weights():
     assert all(parameter.grad is None for parameter in model.policy.encoder.parameters())
 
     before = parameters(model)
-    model._train_encoder(model.rollout_buffer.episodes)
+    model._train_encoder(model.policy.encoder)
     after = parameters(model)
     assert_equal_parameters(before, after, "mlp_extractor.")
     assert_equal_parameters(before, after, "action_net.")
     assert any(not th.equal(before[name], after[name]) for name in before if name.startswith("encoder."))
+
+
+@pytest.mark.parametrize("algorithm", [USPLPPO, RMA])
+def test_updates_side_by_side_are_those_of_one_after_the_other(algorithm, monkeypatch):
+    def learn():
+        with torch_threads(2):
+            model = make_model(algorithm=algorithm, warmup_timesteps=128, ramp_timesteps=128, max_grad_norm=0.1)
+            return parameters(model.learn(512))
+
+    def one_after_the_other(functions, device):
+        with torch_threads(1):  # the share of each, as other threads add up in another order
+            for function in functions:
+                function()
+
+    side_by_side = learn()
+    monkeypatch.setattr("sb3_uspl.uspl_ppo.run_side_by_side", one_after_the_other)
+    assert_equal_parameters(side_by_side, learn())
+
+
+def test_ppo_does_not_clip_by_the_encoders_gradients():
+    runs = []
+    for gradient in (0.0, 1e6):
+        model = make_model(encoder_updates=0, max_grad_norm=0.1)
+        for parameter in model.policy.encoder.parameters():
+            parameter.grad = th.full_like(parameter, gradient)
+        runs.append(model.learn(128))
+    assert_equal_parameters(parameters(runs[0]), parameters(runs[1]))
 
 
 def test_no_encoder_updates_in_warmup_if_asked_so():
