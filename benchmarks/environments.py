@@ -20,6 +20,8 @@ from bullet_tasks import ENV_IDS
 PHYSICS = ("kinematic", "compiled")
 """Of those kinds that train; a task that knows neither is measured as it comes."""
 ONE, TWO, DUMMY, SUBPROC = start_up.VEC_ENVS
+MANY = {"compiled": 256}
+"""Environments of a training, by kind of physics; 64 of the others, which have 30 MB each in PyBullet."""
 WORKERS_TARGET, SUBPROC_TARGET = 1.7, 3.0
 """Times as fast: 2 workers as 1 worker, and as SubprocVecEnv, on a machine with 2 cores."""
 
@@ -198,7 +200,7 @@ def start_ups(env_id: str, n_envs: int = 8, repetitions: int = 5) -> list[Row]:
 def run(
     repetitions: int = 5,
     n_envs: int = 16,
-    n_many: int = 64,
+    n_many: int | None = None,
     n_steps: int = 120,
     n_resets: int = 200,
     env_ids: Sequence[str] = ENV_IDS,
@@ -210,7 +212,7 @@ def run(
 
     :param repetitions: rounds of every comparison
     :param n_envs: number of environments
-    :param n_many: of environments, without SubprocVecEnv
+    :param n_many: of environments, without SubprocVecEnv; None: as many as in a training, see ``MANY``
     :param n_steps: decisions per environment and repetition, half of that with many
     :param n_resets: resets per repetition
     :param env_ids: tasks
@@ -227,10 +229,10 @@ def run(
             table += rows(values, f"{env_id}, {variant}, {n_envs} envs", "decisions / s", SUBPROC)
             gains.setdefault((f"{variant}, {n_envs} envs", SUBPROC, SUBPROC_TARGET), []).append(ratio(values, TWO, SUBPROC))
             gains.setdefault((f"{variant}, {n_envs} envs", ONE, WORKERS_TARGET), []).append(ratio(values, TWO, ONE))
-            # As many as in a training, which SubprocVecEnv would need a process each for.
-            values = throughput(env_id, env_kwargs, n_many, n_steps // 2, repetitions, [ONE, TWO, DUMMY])
-            table += rows(values, f"{env_id}, {variant}, {n_many} envs", "decisions / s", ONE)
-            gains.setdefault((f"{variant}, {n_many} envs", ONE, WORKERS_TARGET), []).append(ratio(values, TWO, ONE))
+            many = n_many or MANY.get(variant, 64)  # SubprocVecEnv would need a process for each
+            values = throughput(env_id, env_kwargs, many, n_steps // 2, repetitions, [ONE, TWO, DUMMY])
+            table += rows(values, f"{env_id}, {variant}, {many} envs", "decisions / s", ONE)
+            gains.setdefault((f"{variant}, {many} envs", ONE, WORKERS_TARGET), []).append(ratio(values, TWO, ONE))
     targets = []
     for (variant, reference, limit), measured in gains.items():
         for name, value in (("worst", min(measured)), ("median", statistics.median(measured))):

@@ -212,7 +212,7 @@ class _TransformerStep(nn.Module):
 
     def initial_state(self, n_envs: int) -> MemoryState:
         t = self.transformer
-        ring = th.zeros(n_envs, t.n_layers, t.n_heads, self.horizon, t.head_width)
+        ring = th.zeros(n_envs, t.n_layers, t.n_key_heads, self.horizon, t.head_width)
         return ring, ring.clone(), th.zeros(n_envs, dtype=th.long)
 
     def step(self, features: th.Tensor, state: MemoryState, _longest: None = None) -> tuple[th.Tensor, MemoryState]:

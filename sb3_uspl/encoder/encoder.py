@@ -49,7 +49,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         scan=False,
         orthogonal=False,
         categorical=False,
-        memory_kwargs={"transformer": {"n_heads": 16, "head_width": 64}},
+        memory_kwargs={"transformer": {"n_heads": 16, "head_width": 64, "shared_keys": False}},
     ),
 }  # fmt: skip
 """

@@ -193,19 +193,31 @@ class TransformerMemory(Memory):
 
     :param width: number of features of input and output
     :param n_heads: attention heads
-    :param head_width: features per head
+    :param head_width: features per head; None shares the width among them
     :param n_layers: Transformer blocks
     :param dropout: share of dropped residual features while training
+    :param shared_keys: whether all heads look up the same keys and values (multi-query attention, Shazeer 2019): a token of a
+        rollout takes as long as the cache that has to be read for it, which is a part of ``n_heads``
     """
 
     CACHE_BLOCK = 64
     """The cache grows by doubling from this many tokens."""
 
-    def __init__(self, width: int, n_heads: int = 4, head_width: int = 32, n_layers: int = 1, dropout: float = 0.0):
+    def __init__(
+        self,
+        width: int,
+        n_heads: int = 4,
+        head_width: int | None = None,
+        n_layers: int = 1,
+        dropout: float = 0.0,
+        shared_keys: bool = True,
+    ):
         super().__init__(width)
-        self.n_heads, self.head_width, self.n_layers = n_heads, head_width, n_layers
+        self.n_heads, self.n_layers = n_heads, n_layers
+        self.head_width = max(1, width // n_heads) if head_width is None else head_width
+        self.n_key_heads = 1 if shared_keys else n_heads
         self.blocks: list[_Block] = nn.ModuleList(  # type: ignore[assignment]
-            _Block(width, n_heads, head_width, dropout) for _ in range(n_layers)
+            _Block(width, n_heads, self.head_width, dropout, self.n_key_heads) for _ in range(n_layers)
         )
         self.norm = nn.RMSNorm(width)
         self.out = nn.Linear(width, width)
@@ -214,7 +226,7 @@ class TransformerMemory(Memory):
         self.slopes: th.Tensor
 
     def initial_state(self, n_envs: int) -> MemoryState:
-        shape = (n_envs, self.n_layers, self.n_heads, self.CACHE_BLOCK, self.head_width)
+        shape = (n_envs, self.n_layers, self.n_key_heads, self.CACHE_BLOCK, self.head_width)
         device = self.slopes.device
         return (
             th.zeros(shape, device=device),
@@ -231,7 +243,8 @@ class TransformerMemory(Memory):
         keys, values = [], []
         for block in self.blocks:
             q, k, v = block.project(padded)
-            padded = block.finish(padded, F.scaled_dot_product_attention(q, k, v, attn_mask=bias))
+            attended = F.scaled_dot_product_attention(q, k.expand_as(q), v.expand_as(q), attn_mask=bias)
+            padded = block.finish(padded, attended)
             keys.append(k)
             values.append(v)
         capacity = self.CACHE_BLOCK
@@ -249,17 +262,24 @@ class TransformerMemory(Memory):
             keys, values = F.pad(keys, padding), F.pad(values, padding)
         rows = th.arange(len(features), device=features.device)
         position = th.arange(n_tokens, device=features.device)
-        bias = self._bias(length[:, None, None], position[None, None, :]).transpose(0, 1)
+        bias = self._grouped(self._bias(length[:, None, None], position[None, None, :]).transpose(0, 1))
         features = features[:, None]
         for index, block in enumerate(self.blocks):
             q, k, v = block.project(features)
             keys[rows, index, :, length] = k[:, :, 0]
             values[rows, index, :, length] = v[:, :, 0]
             attended = F.scaled_dot_product_attention(
-                q, keys[:, index, :, :n_tokens], values[:, index, :, :n_tokens], attn_mask=bias
+                self._grouped(q), keys[:, index, :, :n_tokens], values[:, index, :, :n_tokens], attn_mask=bias
             )
-            features = block.finish(features, attended)
+            features = block.finish(features, attended.reshape(q.shape))
         return self.out(self.norm(features))[:, 0], (keys, values, length + 1)
+
+    def _grouped(self, by_head: th.Tensor) -> th.Tensor:
+        """
+        ``(n_envs, n_heads, 1, ...)``, where heads share their keys as ``(n_envs, 1, n_heads, ...)``: the queries of one head,
+        for which the keys are read once.
+        """
+        return by_head.reshape(len(by_head), self.n_key_heads, -1, by_head.shape[-1])
 
     def _bias(self, query: th.Tensor, key: th.Tensor) -> th.Tensor:
         """ALiBi penalty, minus infinity for the future; ``(n_heads, *broadcast(query, key))``."""
@@ -271,19 +291,19 @@ class TransformerMemory(Memory):
 class _Block(nn.Module):
     """One pre-norm Transformer block without its attention product, which differs between ``forward`` and ``step``."""
 
-    def __init__(self, width: int, n_heads: int, head_width: int, dropout: float):
+    def __init__(self, width: int, n_heads: int, head_width: int, dropout: float, n_key_heads: int):
         super().__init__()
-        self.n_heads = n_heads
+        self.heads = (n_heads, n_key_heads, n_key_heads)
         self.attention_norm = nn.RMSNorm(width)
-        self.qkv = nn.Linear(width, 3 * n_heads * head_width)
+        self.qkv = nn.Linear(width, sum(self.heads) * head_width)
         self.merge = nn.Linear(n_heads * head_width, width)
         self.mlp = nn.Sequential(nn.RMSNorm(width), nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
         self.dropout = nn.Dropout(dropout)
 
     def project(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Queries, keys and values, each ``(n, n_heads, n_tokens, head_width)``."""
-        qkv = self.qkv(self.attention_norm(features)).unflatten(-1, (3, self.n_heads, -1))
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        """Queries, keys and values, each ``(n, n_heads, n_tokens, head_width)``, or with a single head for keys and values."""
+        qkv = self.qkv(self.attention_norm(features)).unflatten(-1, (sum(self.heads), -1))
+        q, k, v = qkv.transpose(1, 2).split(self.heads, dim=1)
         return q, k, v
 
     def finish(self, features: th.Tensor, attended: th.Tensor) -> th.Tensor:

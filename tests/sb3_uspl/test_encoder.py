@@ -25,13 +25,17 @@ from sb3_uspl.encoder import (
 )
 from tests.sb3_uspl.toy import IMAGE, ToyEnv
 
+OWN_KEYS = "transformer, each head with keys of its own"
+
 
 def make_memory(name):
     th.manual_seed(0)
-    return MEMORIES[name](16, **({"n_heads": 2, "head_width": 8, "n_layers": 2} if name == "transformer" else {}))
+    if name in ("transformer", OWN_KEYS):
+        return TransformerMemory(16, n_heads=2, head_width=8, n_layers=2, shared_keys=name != OWN_KEYS)
+    return MEMORIES[name](16)
 
 
-@pytest.mark.parametrize("name", MEMORIES)
+@pytest.mark.parametrize("name", [*MEMORIES, OWN_KEYS])
 def test_steps_equal_whole_episodes_across_resets_and_cache_growth(name):
     memory, n_tokens = make_memory(name), TransformerMemory.CACHE_BLOCK + 20
     features = th.randn(3, n_tokens, 16)
@@ -300,7 +304,7 @@ def test_every_preset_handles_every_input(preset, memory, target):
 
 def test_the_paper_preset_has_the_papers_transformer():
     memory = ObservationEncoder(ToyEnv().observation_space, 1, "paper", "transformer").memory
-    assert (memory.n_heads, memory.head_width, memory.width) == (16, 64, 256)
+    assert (memory.n_heads, memory.n_key_heads, memory.head_width, memory.width) == (16, 16, 64, 256)
 
 
 @pytest.mark.parametrize(

@@ -161,9 +161,10 @@ def test_normalisation_of_the_training_is_inside(tmp_path):
         assert np.abs(model.predict(obs, deterministic=True)[0] - action).max() > 1e-4
 
 
-def test_ring_is_the_cache_up_to_its_size_and_then_forgets_the_oldest():
+@pytest.mark.parametrize("shared_keys", [True, False])
+def test_ring_is_the_cache_up_to_its_size_and_then_forgets_the_oldest(shared_keys):
     th.manual_seed(0)
-    memory, horizon = TransformerMemory(8, n_heads=2, head_width=4), 6
+    memory, horizon = TransformerMemory(8, n_heads=2, head_width=4, shared_keys=shared_keys), 6
     ring = _TransformerStep(memory, horizon)
     features = th.randn(2, 3 * horizon, 8)
     features[1, :horizon] = 5.0  # two robots whose pasts differ long ago only
@@ -198,7 +199,8 @@ def test_card_is_valid_json_and_says_what_the_file_takes(tmp_path):
     assert {part["name"] for part in card["observation"]} | {part["input"] for part in card["memory"]} == set(card["inputs"])
     assert {part["output"] for part in card["memory"]} < set(card["outputs"])
     keys = next(part for part in card["memory"] if part["input"] == "keys")
-    assert keys["shape"] == [1, 4, 12, 32] and keys["initial"] == 0.0
+    memory = model.policy.encoder.memory
+    assert keys["shape"] == [1, memory.n_key_heads, 12, memory.head_width] and keys["initial"] == 0.0
     assert card["environment"] == "Toy" and card["observation"][0]["low"] == -1.0
 
 
