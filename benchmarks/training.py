@@ -274,8 +274,8 @@ def run(
     :param decisions: of an iteration, in all environments; None takes the zoo's
     :param rollout_envs: number of environments for :func:`compare_rollouts`
     :param env_counts: numbers of environments for :func:`end_to_end`
-    :param thread_counts: threads of torch for :func:`end_to_end`
-    :param threads: of torch for everything else
+    :param thread_counts: threads of torch for :func:`end_to_end`; the most of them to compare the methods
+    :param threads: of torch for everything else; phases of updates that run side by side cannot be told apart
     :param image_tasks: further tasks, broken down by phase only
     """
     methods: list[Row] = []
@@ -284,7 +284,7 @@ def run(
     targets: list[Row] = []
     for task in tasks:
         width = memory_width(settings_for(task))
-        values = compare_methods(task, decisions, threads, repetitions)
+        values = compare_methods(task, decisions, max(thread_counts), repetitions)
         methods += rows(values, f"{task}, {task.n_envs} envs, memory of {width}", "samples / s", "RecurrentPPO")
         targets += [
             target(f"{task}: samples/s of USPL / RecurrentPPO", ratio(values, "USPLPPO", "RecurrentPPO"), RECURRENT_TARGET),
@@ -301,7 +301,7 @@ def run(
     best = max(statistics.median(measured) for measured in values.values())
     targets.append(target(f"{tasks[0]}: decisions/s end to end, the best of these", best, SPEED_TARGET))
     return {
-        f"Training, {threads} thread(s)": methods,
+        f"Training, {max(thread_counts)} thread(s)": methods,
         f"An iteration of USPL by phase, {threads} thread(s)": phases,
         "Rollout, 1 thread": rollouts,
         "End to end, USPL with the zoo's settings": rows(values, str(tasks[0]), "decisions / s"),
