@@ -1,4 +1,4 @@
-"""What every benchmark shares: interleaved repetitions, rows and targets, threads, and how results are shown and kept."""
+"""What every benchmark shares: interleaved repetitions, rows and targets, and how results are shown and kept."""
 
 import json
 import statistics

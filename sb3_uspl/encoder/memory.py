@@ -196,8 +196,8 @@ class TransformerMemory(Memory):
     :param head_width: features per head; None shares the width among them
     :param n_layers: Transformer blocks
     :param dropout: share of dropped residual features while training
-    :param shared_keys: whether all heads look up the same keys and values (multi-query attention, Shazeer 2019): a token of a
-        rollout takes as long as the cache that has to be read for it, which is a part of ``n_heads``
+    :param shared_keys: whether all heads look up the same keys and values (multi-query attention, Shazeer 2019). Late in
+        an episode, a rollout's time is that of reading the cache, which is smaller by the factor ``n_heads``
     """
 
     CACHE_BLOCK = 64
