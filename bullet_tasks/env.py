@@ -72,7 +72,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.action_space = task.action_space
         self._action_shape = task.action_space.shape
         self._n_choices = task.action_space.nvec.tolist() if isinstance(task.action_space, spaces.MultiDiscrete) else None
-        self.discrete_privileged = task.discrete_privileged
+        self.discrete_privileged, self.symmetries = task.discrete_privileged, task.symmetries
 
         self.world = World(task.scene, gui=render_mode == "human")
         try:

@@ -1,16 +1,18 @@
 """What ``USPLPPO`` is given: checked before anything is built, and completed from the environments and in decisions."""
 
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_uspl.buffers import USPLRolloutBuffer
-from sb3_uspl.observations import PRIVILEGED, check_observation_space
+from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space
 from sb3_uspl.policies import USPLPolicy
+from sb3_uspl.symmetries import Symmetry, SymmetryGroup
 
 if TYPE_CHECKING:
     from sb3_uspl.uspl_ppo import USPLPPO
@@ -72,6 +74,7 @@ def check_arguments(model: "USPLPPO") -> None:
         "encoder_batch_size": (model.encoder_batch_size, 1, np.inf),
         "context_length": (model.context_length, 1, np.inf),
         "encoder_window": (1 if model.encoder_window is None else model.encoder_window, 1, np.inf),
+        "encoder_window_timesteps": (model.encoder_window_timesteps or 0, 0, np.inf),
         "encoder_beta": (model.encoder_beta, 0, 1),
         "wander_share": (model.wander_share, 0, 1),
         "mismatch_fraction": (model.mismatch_fraction or 0.0, 0, 0.9),
@@ -153,6 +156,34 @@ def ask_discrete_privileged(env: VecEnv | None, given: dict[int, list[float]] | 
     if given is None and env is not None and env.has_attr("discrete_privileged"):
         given = env.get_attr("discrete_privileged", indices=[0])[0]
     return {int(dim): [float(value) for value in values] for dim, values in (given or {}).items()}
+
+
+def ask_symmetries(env: VecEnv | None, given: Sequence[Symmetry] | bool) -> tuple[Symmetry, ...]:
+    """
+    Symmetries of the environment's world.
+
+    :param env: is asked for them if ``given`` is True
+    :param given: wins over the environment's; False: none are used
+    :raises ValueError: if there are none, they do not fit the observations, or ``common`` is normalised
+    """
+    if env is None or not given:
+        return tuple(given or ())  # type: ignore[arg-type]
+    if given is True:
+        given = env.get_attr("symmetries", indices=[0])[0] if env.has_attr("symmetries") else ()
+        if not given:
+            raise ValueError(
+                "symmetries=True, but the environment lists none: give it an attribute `symmetries`, pairs of matrices for "
+                "`common` and `privileged`, or leave the argument out."
+            )
+    assert isinstance(env.observation_space, spaces.Dict)
+    SymmetryGroup(given, *(get_flattened_obs_dim(env.observation_space[key]) for key in (COMMON, PRIVILEGED)))
+    normalize = unwrap_vec_normalize(env)
+    if normalize is not None and normalize.norm_obs and COMMON in (normalize.norm_obs_keys or ()):
+        raise ValueError(
+            "`symmetries` are given, but VecNormalize normalises `common`, which then has others: leave it out of "
+            "norm_obs_keys; encoder and policy normalise it themselves."
+        )
+    return tuple(given)
 
 
 def ask_decision_period(env: VecEnv | None, given: float | None) -> float:

@@ -22,6 +22,7 @@ from sb3_uspl.observations import (
     TRUTH,
     policy_observation_space,
 )
+from sb3_uspl.symmetries import SymmetryGroup
 
 
 def _shape(space: spaces.Space) -> tuple[int, ...]:
@@ -105,6 +106,8 @@ class EpisodeReplayBuffer:
         self.n_envs, self.n_mismatched = n_envs, n_mismatched
         self.context_length, self.max_bytes, self.keep = context_length, max_bytes, keep
         self.rng = np.random.default_rng(seed)
+        self.symmetries: SymmetryGroup | None = None
+        """Every episode that is drawn is turned by one of them at random."""
         self._spec: dict[str, tuple[tuple[int, ...], Any]] = {
             COMMON: (_shape(observation_space[COMMON]), np.float32),
             PREVIOUS_ACTION: ((n_action,), np.float32),
@@ -180,8 +183,7 @@ class EpisodeReplayBuffer:
         n_batches: int,
         n_tokens: int,
         device: th.device | str = "cpu",
-        fresh_window: int | None = None,
-        replay_window: int | None = None,
+        window: int | None = None,
     ) -> Generator[EpisodeBatch, None, None]:
         """
         Draw whole episodes or windows of them, half of the tokens from this iteration, half replayed (Sec. 3.2); all from one
@@ -193,39 +195,43 @@ class EpisodeReplayBuffer:
         :param n_batches: number of batches
         :param n_tokens: about how many decisions in each
         :param device: of the tensors
-        :param fresh_window: decisions in a row that are drawn of an episode of this iteration, from anywhere in it; None: all.
-            Episodes are as likely as each other whatever their length.
-        :param replay_window: the same for replayed episodes
+        :param window: decisions in a row that are drawn of an episode, from anywhere in it; None: all. Episodes are as likely
+            as each other whatever their length.
         """
         fresh = self._eligible_fresh()
         episodes = [*fresh, *self.replay]
         lengths = np.array([len(episode) for episode in episodes], dtype=np.int64)
         starts = np.cumsum(lengths) - lengths  # of the episodes, if the decisions of all of them lay one after another
-        ranges = ((0, len(fresh), fresh_window), (len(fresh), len(episodes), replay_window))
-        sources = [(np.arange(low, high), window) for low, high, window in ranges if low < high]
+        ranges = ((0, len(fresh)), (len(fresh), len(episodes)))
+        sources = [np.arange(low, high) for low, high in ranges if low < high]
         if not sources:
             return
         for first in range(0, n_batches, self.STAGED_BATCHES):
             count = min(self.STAGED_BATCHES, n_batches - first)
-            pieces = [self._choose(sources, starts, lengths, n_tokens) for _ in range(count)]
+            pieces = [self._choose(sources, starts, lengths, n_tokens, window) for _ in range(count)]
             decisions = np.concatenate([_ranges(*piece) for piece in pieces])
             unique, places = np.unique(decisions, return_inverse=True)
             staged = self._gather(episodes, starts, unique, device)
             sizes = th.as_tensor(np.concatenate([size for _, size in pieces]), device=device)
             all_places = th.as_tensor(places, device=device).split([int(size.sum()) for _, size in pieces])
             for place, size in zip(all_places, sizes.split([len(size) for _, size in pieces]), strict=True):
-                yield EpisodeBatch({key: value[place] for key, value in staged.tokens.items()}, staged.truth[place], size)
+                tokens, truth = {key: value[place] for key, value in staged.tokens.items()}, staged.truth[place]
+                if self.symmetries is not None:
+                    which = self.symmetries.random(size, self.rng)
+                    turned = self.symmetries.turn({COMMON: tokens[COMMON], TRUTH: truth}, which)
+                    tokens[COMMON], truth = turned[COMMON], turned[TRUTH]
+                yield EpisodeBatch(tokens, truth, size)
 
     def _eligible_fresh(self) -> list[Episode]:
         only_mismatched = self.telltale and self.keep == "mismatched" and self.n_mismatched > 0
         return [episode for episode in self.fresh if episode.mismatched or not only_mismatched]
 
     def _choose(
-        self, sources: list[tuple[np.ndarray, int | None]], starts: np.ndarray, lengths: np.ndarray, n_tokens: int
+        self, sources: list[np.ndarray], starts: np.ndarray, lengths: np.ndarray, n_tokens: int, window: int | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """First decisions and lengths of a batch's pieces, an equal share of the tokens from each source."""
         firsts, sizes = [], []
-        for rows, window in sources:
+        for rows in sources:
             share = n_tokens / len(sources)
             drawn = self.rng.choice(rows, math.ceil(share))  # enough if every episode had a single decision
             size = lengths[drawn] if window is None else np.minimum(lengths[drawn], window)

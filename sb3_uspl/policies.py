@@ -1,13 +1,11 @@
 """Policies: actor and critic for PPO, and the observation encoder that turns the actor into the deployment policy."""
 
 import contextlib
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -19,7 +17,7 @@ from torch import nn
 
 from sb3_uspl.activations import recoverable_tanh
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
-from sb3_uspl.encoder import MIN_STD, MemoryState, ObservationEncoder, RunningNormalizer, encode_actions, reset_rows
+from sb3_uspl.encoder import MemoryState, ObservationEncoder, encode_actions, reset_rows
 from sb3_uspl.observations import (
     BELIEF,
     COMMON,
@@ -34,11 +32,9 @@ from sb3_uspl.observations import (
     is_image,
     policy_observation_space,
 )
+from sb3_uspl.policy_features import PolicyFeatures
+from sb3_uspl.symmetries import Symmetry, SymmetryGroup
 from sb3_uspl.uncertainty import INITIAL_STD, smooth
-
-BELIEF_SHARE = 0.3
-"""Gain of the encoder's mean as an input, relative to the privileged observation's: at an equal gain, a policy that may take
-either relies on the mean before the encoder is worth it."""
 
 
 class DeploymentState(NamedTuple):
@@ -52,76 +48,6 @@ class DeploymentState(NamedTuple):
     """Encoded last action, ``(n_envs, n_action)``."""
     memory: tuple[np.ndarray, ...]
     """The encoder's memory."""
-
-
-class PolicyFeatures(BaseFeaturesExtractor):
-    """
-    Concatenates what the actor or the critic sees, each part brought to about unit scale.
-
-    :param observation_space: with the keys ``POLICY_KEYS``
-    :param privileged_key: ``privileged`` (blurred) for the actor, ``truth`` for the critic
-    :param uncertainty_input: whether the uncertainty is seen
-    :param mean_input: whether the encoder's mean is seen
-    :param privileged_gain: factor on privileged values, whose scale is 0.2-0.25 by contract
-    :param normalize_common: whether the common observation is brought to zero mean and unit variance
-    :param one_hot: discrete dimensions that are seen as one number for each of their values, and these; None: there are none
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Dict,
-        privileged_key: str,
-        uncertainty_input: bool,
-        mean_input: bool,
-        privileged_gain: float,
-        normalize_common: bool,
-        one_hot: dict[int, list[float]] | None = None,
-    ):
-        n_privileged = get_flattened_obs_dim(observation_space[PRIVILEGED])
-        n_common = get_flattened_obs_dim(observation_space[COMMON])
-        one_hot = one_hot or {}
-        n_seen = n_privileged + sum(len(values) - 1 for values in one_hot.values())
-        super().__init__(observation_space, n_common + n_seen * (1 + mean_input) + n_privileged * uncertainty_input)
-        self.privileged_key = privileged_key
-        self.one_hot = {dim: sorted(values) for dim, values in one_hot.items()}
-        self.continuous = [dim for dim in range(n_privileged) if dim not in one_hot]
-        self.uncertainty_input, self.mean_input = uncertainty_input, mean_input
-        self.privileged_gain = privileged_gain
-        self.common_normalizer = RunningNormalizer(n_common) if normalize_common else nn.Identity()
-
-    def forward(self, obs: dict[str, th.Tensor]) -> th.Tensor:
-        """
-        :param obs: batch by key, ``(n, ...)``
-        :return: ``(n, features_dim)``
-        """
-        parts = [self.common_normalizer(obs[COMMON]), self._seen(obs[self.privileged_key])]
-        if self.uncertainty_input:
-            # Log scale, as the reward transformation: INITIAL_STD -> 0, MIN_STD -> -1. The warm-up knows little but 0, so
-            # that certainty, when it comes, does not act through weights that grew as a bias.
-            parts.append(-th.log(obs[UNCERTAINTY].clamp(min=MIN_STD) / INITIAL_STD) / math.log(MIN_STD / INITIAL_STD))
-        if self.mean_input:
-            parts.append(self._seen(obs[BELIEF]) * BELIEF_SHARE)
-        return th.cat(parts, dim=1)
-
-    def _seen(self, privileged: th.Tensor) -> th.Tensor:
-        if not self.one_hot:
-            return privileged * self.privileged_gain
-        parts = [privileged[:, self.continuous] * self.privileged_gain]
-        parts += [one_hot(privileged[:, dim], values) for dim, values in self.one_hot.items()]
-        return th.cat(parts, dim=1)
-
-
-def one_hot(x: th.Tensor, values: Sequence[float]) -> th.Tensor:
-    """
-    How much of each value a number is: 1 of the one that it equals, shares of its two neighbours in between.
-
-    :param x: ``(n,)``
-    :param values: at least two, in order
-    :return: ``(n, n_values)``, not negative, each row's sum is 1
-    """
-    v = th.tensor(values, dtype=x.dtype, device=x.device)
-    passed = ((x[:, None] - v[:-1]) / (v[1:] - v[:-1])).clamp(0.0, 1.0)
-    return F.pad(passed, (1, 0), value=1.0) - F.pad(passed, (0, 1))
 
 
 class USPLPolicy(ActorCriticPolicy):
@@ -151,6 +77,7 @@ class USPLPolicy(ActorCriticPolicy):
     :param privileged_gain: factor that brings privileged values to unit scale
     :param normalize_common: whether actor and critic see the common observation with zero mean and unit variance: a corridor's
         width in units of the whole arena would otherwise take PPO long to notice
+    :param symmetries: of the world, see ``SymmetryGroup``: actor and critic see situations that look the same as one of them
     :param bounded_mean: whether the mean of continuous actions is squashed into the action space by a tanh, as in the authors'
         release, with the gradient of ``recoverable_tanh``. Without it the mean drifts beyond the bounds, where sampling
         changes nothing any more and a habit of the warm-up cannot be unlearned.
@@ -184,6 +111,7 @@ class USPLPolicy(ActorCriticPolicy):
         privileged_gain: float = 4.0,
         normalize_common: bool = True,
         one_hot: bool = False,
+        symmetries: Sequence[Symmetry] = (),
         bounded_mean: bool = True,
         initial_action: Sequence[float] | None = None,
         noise_correlation: float = 0.0,
@@ -214,6 +142,7 @@ class USPLPolicy(ActorCriticPolicy):
             privileged_gain=privileged_gain,
             normalize_common=normalize_common,
             one_hot=one_hot,
+            symmetries=symmetries,
         )
         for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
             if kwargs.pop(name, None) not in (None, PolicyFeatures, {}, False):
@@ -259,6 +188,12 @@ class USPLPolicy(ActorCriticPolicy):
         discrete = self.encoder_arguments["discrete_privileged"] or {}
         arguments = {**self.feature_arguments, "one_hot": discrete if self.feature_arguments["one_hot"] else {}}
         return PolicyFeatures(self.observation_space, key, **arguments)  # type: ignore[arg-type]
+
+    @property
+    def symmetries(self) -> SymmetryGroup | None:
+        """Those of the world that are made use of."""
+        assert isinstance(self.pi_features_extractor, PolicyFeatures)
+        return self.pi_features_extractor.symmetries
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -311,10 +246,10 @@ class USPLPolicy(ActorCriticPolicy):
 
         :param common: ``(..., n_common)``
         """
-        common = common.reshape(-1, common.shape[-1])
+        seen = th.as_tensor(common.reshape(-1, common.shape[-1]), dtype=th.float32, device=self.device)
         for features in (self.pi_features_extractor, self.vf_features_extractor):
-            if isinstance(features.common_normalizer, RunningNormalizer):
-                features.common_normalizer.update(th.as_tensor(common, dtype=th.float32, device=self.device))
+            assert isinstance(features, PolicyFeatures)
+            features.update_normalizer(seen)
 
     @contextlib.contextmanager
     def without_encoder(self) -> Iterator[ObservationEncoder]:

@@ -16,13 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_uspl._arguments import (
-    ask_decision_period,
-    ask_discrete_privileged,
-    check_arguments,
-    count_mismatched,
-    in_decisions,
-)
+from sb3_uspl import _arguments
 from sb3_uspl._threads import run_side_by_side, torch_threads
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
@@ -30,6 +24,7 @@ from sb3_uspl.encoder import ObservationEncoder
 from sb3_uspl.observations import COMMON
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
+from sb3_uspl.symmetries import Symmetry
 from sb3_uspl.uncertainty import C_MAX, C_MIN, DELTA, smoothing_factor
 from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
 
@@ -103,27 +98,26 @@ class USPLPPO(PPO):
     :param wander_share: share of time in which a mismatched environment repeats a random action of its own, so that the
         encoder sees what the policy does not look at yet (0 in the release)
     :param wander_time: least and greatest length of such a stretch in s
-    :param wander_actions: components of a continuous action that are drawn at random there, and what each is drawn around,
-        e.g. ``{1: 0.6}``, where the policy has no reason yet to turn a camera to what is to be seen; the others stay the
-        policy's. None: all, around the middle of the action space.
+    :param wander_actions: components of a continuous action that are drawn at random there, and around what (``{1: 0.6}``),
+        where the policy has no reason yet to turn a camera to what is to be seen. None: all, around the middle.
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
     :param replay_bytes: memory budget of the episode replay
-    :param encoder_learning_rate: of the encoder; constant, as in the release, unless a schedule is given (Tables 4 and 5: 5e-5
-        and 2e-5 for the large encoder)
-    :param encoder_learning_rate_floor: share of it that is left at the end of training, after half a cosine wave
+    :param encoder_learning_rate: of the encoder (Tables 4 and 5: 5e-5 and 2e-5 for the large one), or a schedule
+    :param encoder_learning_rate_floor: share of it left at the end of training, after half a cosine wave (release: 1)
     :param encoder_weight_decay: of the encoder (Tables 4 and 5)
     :param encoder_batch_size: decisions per encoder update, in whole episodes (Tables 4 and 5: 8000, 16000)
     :param encoder_updates: encoder updates per rollout (Tables 4 and 5: 450, 170). A loaded model that goes on training begins
         with an empty replay: until that suffices for as many or is full, there is no more than one pass over it per rollout.
     :param encoder_max_grad_norm: gradient clipping of the encoder
-    :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1 as it stands
+    :param encoder_beta: of the encoder's loss, see ``gaussian_nll``; 0 is Eq. 1
     :param encoder_warmup: whether the encoder learns during the warm-up (not in the release)
-    :param encoder_window: decisions in a row, from anywhere in an episode, that the encoder learns from where one image that
-        tells something is lost among the many of its episode (1: single ones): during the warm-up always, afterwards of
-        replayed episodes, while fresh ones are whole; None: whole episodes
+    :param encoder_window: decisions in a row, from anywhere in an episode, that the encoder learns from at first, where one
+        image that tells something is lost among the many of its episode (1: single ones); None: whole episodes
+    :param encoder_window_timesteps: decisions until it learns from whole episodes. None: those of the warm-up.
     :param encoder_bf16: whether the encoder's update computes in bfloat16 where torch's autocast deems it safe; for GPUs
-    :param encoder_compile: whether ``torch.compile`` translates the encoder for its update; takes minutes at the start, meant
-        for the "paper" preset on a GPU
+    :param encoder_compile: whether ``torch.compile`` translates the encoder for its update: takes minutes; for GPUs
+    :param symmetries: of the world (see ``SymmetryGroup``; not in the paper): the encoder also learns from episodes as they
+        would have been in a turned one, actor and critic see one of those that look the same. True asks the environment.
     :param context_length: longest episode, in decisions
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
@@ -202,8 +196,10 @@ class USPLPPO(PPO):
         encoder_beta: float = 0.5,
         encoder_warmup: bool = True,
         encoder_window: int | None = None,
+        encoder_window_timesteps: int | None = None,
         encoder_bf16: bool = False,
         encoder_compile: bool = False,
+        symmetries: Sequence[Symmetry] | bool = False,
         context_length: int = 1024,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -263,9 +259,10 @@ class USPLPPO(PPO):
         self.encoder_weight_decay = encoder_weight_decay
         self.encoder_batch_size, self.encoder_updates = encoder_batch_size, encoder_updates
         self.encoder_max_grad_norm, self.encoder_warmup = encoder_max_grad_norm, encoder_warmup
-        self.encoder_beta, self.encoder_window = encoder_beta, encoder_window
+        self.encoder_beta = encoder_beta
+        self.encoder_window, self.encoder_window_timesteps = encoder_window, encoder_window_timesteps
         self.encoder_bf16, self.encoder_compile = encoder_bf16, encoder_compile
-        self.context_length = context_length
+        self.context_length, self.symmetries = context_length, symmetries
         self._rollout_env: UncertaintyVecWrapper | None = None
         self._progress_period: tuple[int, int] | None = None
         self._replay_is_lost = False
@@ -275,10 +272,11 @@ class USPLPPO(PPO):
     # -- set-up ------------------------------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
-        self.discrete_privileged = ask_discrete_privileged(self.env, self.discrete_privileged)
+        self.discrete_privileged = _arguments.ask_discrete_privileged(self.env, self.discrete_privileged)
+        self.symmetries = _arguments.ask_symmetries(self.env, self.symmetries)
         self._check_arguments()
-        self.n_mismatched = count_mismatched(self.mismatch_fraction, self.n_envs)
-        period = self.decision_period = ask_decision_period(self.env, self.decision_period)
+        self.n_mismatched = _arguments.count_mismatched(self.mismatch_fraction, self.n_envs)
+        period = self.decision_period = _arguments.ask_decision_period(self.env, self.decision_period)
         rate, floor = self.encoder_learning_rate, self.encoder_learning_rate_floor
         self.encoder_lr_schedule = FloatSchedule(CosineSchedule(rate, floor) if isinstance(rate, int | float) else rate)
         smoothing = smoothing_factor(self.smoothing_time, self.decision_period)
@@ -289,6 +287,7 @@ class USPLPPO(PPO):
             "mean_input": self.mean_input,
             "discrete_privileged": self.discrete_privileged,
             "smoothing": smoothing,
+            "symmetries": self.symmetries,
             "noise_correlation": smoothing_factor(self.action_noise_time, self.decision_period),
             "encoder_learning_rate": self.encoder_lr_schedule(1.0),
             "encoder_weight_decay": self.encoder_weight_decay,
@@ -308,6 +307,7 @@ class USPLPPO(PPO):
             self.replay,
             self.seed,
         )
+        self.rollout_buffer.episodes.symmetries = self.policy.symmetries
         if self.action_std is not None and isinstance(self.action_space, spaces.Box):
             self._action_std_share: CosineSchedule | None = CosineSchedule(1.0, self.action_std_floor)
             self.policy.set_action_std(self.action_std)
@@ -326,15 +326,15 @@ class USPLPPO(PPO):
             delta=self.delta,
             discrete_privileged=self.discrete_privileged,
             n_mismatched=self.n_mismatched,
-            mismatch_hold=hold and in_decisions("mismatch_hold_time", hold, period),
+            mismatch_hold=hold and _arguments.in_decisions("mismatch_hold_time", hold, period),
             wander_share=self.wander_share,
-            wander_hold=in_decisions("wander_time", self.wander_time, period),
+            wander_hold=_arguments.in_decisions("wander_time", self.wander_time, period),
             wander_actions=self.wander_actions,
         )
         self._rollout_env = None
 
     def _check_arguments(self) -> None:
-        check_arguments(self)
+        _arguments.check_arguments(self)
 
     # -- training ----------------------------------------------------------------------------------------------------------
 
@@ -458,9 +458,10 @@ class USPLPPO(PPO):
         # A compiled function cannot be saved, but torch remembers what it has compiled: asking again is cheap.
         forward = th.compile(encoder.__call__, dynamic=True) if self.encoder_compile else encoder
         metrics = []
-        fresh_window = self.encoder_window if self.progress == 0.0 else None
+        limit = self.encoder_window_timesteps
+        whole = self.progress > 0.0 if limit is None else self.num_timesteps >= limit
         n_updates, n_tokens = self._count_encoder_updates(episodes), self.encoder_batch_size
-        batches = episodes.batches(n_updates, n_tokens, self.device, fresh_window, self.encoder_window)
+        batches = episodes.batches(n_updates, n_tokens, self.device, None if whole else self.encoder_window)
         for update, (tokens, truth, lengths) in enumerate(batches):
             if update == 0:
                 encoder.features.update_normalizers(tokens)

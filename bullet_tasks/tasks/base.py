@@ -42,6 +42,9 @@ class Task(ABC):
     """What only training knows, ``(n_privileged,)``."""
     discrete_privileged: Mapping[int, Sequence[float]] = {}
     """The privileged dimensions that are discrete, and their values."""
+    symmetries: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+    """Of the world: matrices that turn ``common`` and ``privileged`` into those of the same episode in a world that is turned
+    or mirrored, where sensors and actions stay what they were."""
     camera: ClassVar[Camera]
     """Shows the whole scene."""
     judge: Judge

@@ -13,6 +13,22 @@ CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 """Signs of x and y."""
 
 
+def quarter_turns(n_common: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """
+    Symmetries of a square world whose four corners look alike.
+
+    :param n_common: size of ``common``, which begins with x, y, cos(yaw) and sin(yaw); the rest does not turn
+    :return: matrices for ``common`` and ``privileged`` for turns by 90, 180 and 270 degrees
+    """
+    pairs = []
+    for angle in (1, 2, 3):
+        matrix = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), angle)
+        common = np.eye(n_common)
+        common[:2, :2] = common[2:4, 2:4] = matrix
+        pairs.append((common, matrix))
+    return tuple(pairs)
+
+
 class CornerTask(NavigationTask):
     """
     Walk to the right one of four corners; a wrong one ends the episode as a failure.

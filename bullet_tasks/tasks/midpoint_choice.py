@@ -16,7 +16,7 @@ from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
 from bullet_tasks.tasks.configuration import configured
-from bullet_tasks.tasks.corners import CORNERS, CornerTask
+from bullet_tasks.tasks.corners import CORNERS, CornerTask, quarter_turns
 from bullet_tasks.tasks.navigation import NavigationReward
 
 _FLOOR: Colour = (0.86, 0.87, 0.84, 1.0)
@@ -155,6 +155,7 @@ class MidpointChoice(CornerTask):
     def __init__(self, config: MidpointChoiceConfig | Mapping[str, Any] | None = None) -> None:
         self.config = c = configured(MidpointChoiceConfig(), config)
         super().__init__((c.corner, c.corner), c.decision_period, c.time_limit, c.goal_radius, c.reward)
+        self.symmetries = quarter_turns(4)
         # Columns cannot change their height: the tallest possible ones are sunk into the ground by what is too much.
         self._column_length = c.drop + c.low_height[1] + c.middle_step[1] + c.tall_step[1]
         self.scene = self._scene()

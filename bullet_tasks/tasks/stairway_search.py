@@ -17,7 +17,7 @@ from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
 from bullet_tasks.tasks.configuration import configured
-from bullet_tasks.tasks.corners import CORNERS, CornerTask
+from bullet_tasks.tasks.corners import CORNERS, CornerTask, quarter_turns
 from bullet_tasks.tasks.navigation import MAX_TURN, NavigationReward
 from bullet_tasks.tasks.seeing import make_seeing_env
 
@@ -160,6 +160,7 @@ class StairwaySearch(CornerTask):
         super().__init__((c.corner, c.corner), c.decision_period, c.time_limit, c.goal_radius, c.reward)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.common_space = spaces.Box(-1.0, 1.0, (5,), np.float32)
+        self.symmetries = quarter_turns(5)
         # A shape cannot change its length: all stairs are as long as the longest, and the rest is under the platform.
         self._flight_length = (c.cut[1] + c.step_reach[1] - 2.0 * c.half_side) / math.sqrt(2.0)
         self.scene = self._scene()

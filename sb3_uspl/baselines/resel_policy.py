@@ -15,9 +15,10 @@ from torch import nn
 
 from sb3_uspl.activations import recoverable_tanh
 from sb3_uspl.baselines.sequences import EMBEDDING, HistoryEncoder, SequenceBatch
-from sb3_uspl.encoder import RunningNormalizer, Tokens, encode_actions, reset_rows
+from sb3_uspl.encoder import Tokens, encode_actions, reset_rows
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_observation_space
-from sb3_uspl.policies import PolicyFeatures, USPLPolicy
+from sb3_uspl.policies import USPLPolicy
+from sb3_uspl.policy_features import PolicyFeatures
 
 
 class HistoryState(NamedTuple):
@@ -162,8 +163,8 @@ class RESeLPolicy(ActorCriticPolicy):
         """
         self.encoder.features.update_normalizers(tokens)
         for features in (self.pi_features_extractor, self.vf_features_extractor):
-            if isinstance(features.common_normalizer, RunningNormalizer):
-                features.common_normalizer.update(tokens[COMMON].float())
+            assert isinstance(features, PolicyFeatures)
+            features.update_normalizer(tokens[COMMON].float())
 
     def predict(  # type: ignore[override]
         self,

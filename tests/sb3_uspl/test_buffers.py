@@ -81,22 +81,12 @@ def test_windows_are_decisions_in_a_row_from_anywhere_in_an_episode(window):
     stored = {(e.arrays["truth"][0, 0], *e.arrays["common"][i : i + window, 0]) for e in episodes.fresh for i in range(9)}
     stored = {piece for piece in stored if len(piece) == 1 + window}
     seen = set()
-    for batch in episodes.batches(5 * EpisodeReplayBuffer.STAGED_BATCHES, 50, fresh_window=window):
+    for batch in episodes.batches(5 * EpisodeReplayBuffer.STAGED_BATCHES, 50, window=window):
         lengths = batch.lengths.tolist()
         assert max(lengths) == window and 50 <= sum(lengths) == len(batch.truth) < 50 + window
         for truth, common in zip(batch.truth.split(lengths), batch.tokens["common"].split(lengths), strict=True):
             seen |= {(truth[0, 0].item(), *common[:, 0].tolist())} if len(common) == window else set()
     assert seen == stored
-
-
-def test_windows_of_replayed_episodes_leave_fresh_ones_whole():
-    episodes = replayed_and_fresh()
-    (batch,) = episodes.batches(1, 1000, replay_window=1)
-    firsts = [common[0, 0].item() for common in batch.tokens["common"].split(batch.lengths.tolist())]
-    assert {(length, first >= 20) for length, first in zip(batch.lengths.tolist(), firsts, strict=True)} == {
-        (5, True),
-        (1, False),
-    }
 
 
 def test_half_of_a_batch_is_fresh_and_half_replayed():

@@ -12,7 +12,7 @@ import bullet_tasks  # noqa: F401
 from bullet_tasks.vec_env import BulletVecEnv
 from sb3_uspl import RMA, USPLPPO
 from sb3_uspl.encoder import ObservationEncoder
-from sb3_uspl.policies import one_hot
+from sb3_uspl.policy_features import one_hot
 from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
 from tests.sb3_uspl.toy import ToyEnv
 

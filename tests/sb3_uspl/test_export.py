@@ -44,6 +44,8 @@ def make_model(algorithm=USPLPPO, memory="gru", target=None, action_space=None, 
     if algorithm is RESeLPPO:  # it hears its own continuous action: at high frequencies, untrained, rounding errors grow
         sizes["frequencies"] = 0
     kwargs = dict(memory=memory, encoder_kwargs=sizes) | (dict(one_hot=True) if more else {})
+    if target is VECTOR:
+        more["symmetries"] = [(np.diag([1.0, -1.0]), np.array([[-1.0]]))]
     model = algorithm("MlpPolicy", venv, n_steps=16, batch_size=64, policy_kwargs=kwargs, device="cpu", seed=0, **more)
     rng = th.Generator().manual_seed(0)
     with th.no_grad():  # an untrained policy hardly acts

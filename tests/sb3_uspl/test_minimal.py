@@ -14,7 +14,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from sb3_uspl import encoder, minimal, schedules, uncertainty
 from sb3_uspl.envs import TargetReachingEnv
 from sb3_uspl.observations import BELIEF, COMMON, PRIVILEGED, TRUTH, UNCERTAINTY, policy_observation_space
-from sb3_uspl.policies import PolicyFeatures
+from sb3_uspl.policy_features import PolicyFeatures
 
 RNG = np.random.default_rng(3)
 TINY = replace(minimal.USPL, iterations=3, episodes=8, encoder_episodes=4, encoder_updates=2, epochs=2, width=16)

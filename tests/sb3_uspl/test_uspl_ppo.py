@@ -415,13 +415,14 @@ def test_a_range_of_times_is_two_positive_numbers(name, times):
         USPLPPO("MlpPolicy", venv, n_steps=8, batch_size=16, mismatch_fraction=0.0, **{name: times})
 
 
-def test_the_encoder_learns_from_windows_during_the_warm_up_and_from_whole_episodes_after():
-    model = make_model(encoder_window=2, warmup_timesteps=3 * 128, ramp_timesteps=0)
+@pytest.mark.parametrize("until", [None, 2 * 128])
+def test_the_encoder_learns_from_windows_at_first_and_from_whole_episodes_then(until):
+    model = make_model(encoder_window=2, encoder_window_timesteps=until, warmup_timesteps=3 * 128, ramp_timesteps=0)
     longest, batches = [], model.rollout_buffer.episodes.batches
 
     def watched(*args):
         for batch in batches(*args):
-            longest.append((model.progress > 0.0, int(batch.lengths.max())))
+            longest.append((model.num_timesteps >= (until or 3 * 128), int(batch.lengths.max())))
             yield batch
 
     model.rollout_buffer.episodes.batches = watched
