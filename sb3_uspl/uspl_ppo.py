@@ -21,6 +21,7 @@ from sb3_uspl._threads import run_side_by_side, torch_threads
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from sb3_uspl.encoder import ObservationEncoder
+from sb3_uspl.encoder.training import fit
 from sb3_uspl.observations import COMMON
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.schedules import CosineSchedule, cosine_progress
@@ -455,34 +456,13 @@ class USPLPPO(PPO):
         update_learning_rate(optimizer, learning_rate)
         self.logger.record("encoder/learning_rate", learning_rate)
         encoder.train()
-        # A compiled function cannot be saved, but torch remembers what it has compiled: asking again is cheap.
-        forward = th.compile(encoder.__call__, dynamic=True) if self.encoder_compile else encoder
-        metrics = []
         limit = self.encoder_window_timesteps
         whole = self.progress > 0.0 if limit is None else self.num_timesteps >= limit
         n_updates, n_tokens = self._count_encoder_updates(episodes), self.encoder_batch_size
         batches = episodes.batches(n_updates, n_tokens, self.device, None if whole else self.encoder_window)
-        for update, (tokens, truth, lengths) in enumerate(batches):
-            if update == 0:
-                encoder.features.update_normalizers(tokens)
-            with th.autocast(self.device.type, th.bfloat16, enabled=self.encoder_bf16):
-                belief, _ = forward(tokens, lengths)
-            belief = belief.float()
-            loss = encoder.loss(belief, truth, self.encoder_beta)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            th.nn.utils.clip_grad_norm_(encoder.parameters(), self.encoder_max_grad_norm)
-            optimizer.step()
-            with th.no_grad():
-                error = (belief.mean - truth).abs().mean()
-                numbers = (encoder.loss(belief, truth), error, belief.std.mean(), encoder.accuracy(belief, truth))
-                metrics.append(th.stack(numbers))
-        optimizer.zero_grad(set_to_none=True)
-        if metrics:
-            names = ("nll", "error", "std", "accuracy")
-            for name, value in zip(names, th.stack(metrics).mean(0).tolist(), strict=True):
-                if name != "accuracy" or encoder.discrete:
-                    self.logger.record(f"encoder/{name}", value)
+        clipping, bf16, compiled = self.encoder_max_grad_norm, self.encoder_bf16, self.encoder_compile
+        for name, value in fit(encoder, optimizer, batches, self.encoder_beta, clipping, bf16, compiled).items():
+            self.logger.record(f"encoder/{name}", value)
 
     def _count_encoder_updates(self, episodes: EpisodeReplayBuffer) -> int:
         """A model that was loaded knows more than the first few episodes of a new replay, which it would learn by heart."""
