@@ -122,7 +122,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         for sensor in self.sensors:
             sensor.reset(scene, self.np_random)
         self._elapsed_substeps = 0
-        info = {"is_success": False, "position": np.array((state.x, state.y), dtype=np.float32)}
+        info = {"is_success": False, "position": np.array(state.position, dtype=np.float32)}
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
@@ -142,7 +142,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         terms = task.reward_terms(state, contacts * robot.substep_period, time_left, outcome)
         info = {
             "is_success": outcome is Outcome.SUCCESS,
-            "position": np.array((state.x, state.y), dtype=np.float32),
+            "position": np.array(state.position, dtype=np.float32),
             "reward_terms": terms,
             "fallen": robot.fallen,
         }

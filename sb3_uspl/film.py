@@ -178,7 +178,7 @@ def _new_clip(env: gym.Env, seed: int, truth: np.ndarray, policy: str) -> Clip:
 
 
 def _pose(world: Any, info: dict[str, Any], before: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
-    x, y = map(float, info["position"])
+    x, y = map(float, info["position"][:2])
     if hasattr(world, "robot"):
         return x, y, world.robot.state.yaw
     # A point has no heading: it looks where it goes.

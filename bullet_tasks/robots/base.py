@@ -35,6 +35,11 @@ class RobotState(NamedTuple):
     pitch: float = 0.0
     """rad, nose down positive."""
 
+    @property
+    def position(self) -> tuple[float, ...]:
+        """Where it is, for ``info["position"]``: x and y in m, and the altitude of what flies."""
+        return self.x, self.y
+
 
 class Stretch(NamedTuple):
     """What came of some substeps; the robot's state is that after the last of them."""

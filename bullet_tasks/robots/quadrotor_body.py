@@ -92,6 +92,11 @@ class QuadrotorState(RobotState):
     time: float
     """Since the start, s."""
 
+    @property
+    def position(self) -> tuple[float, ...]:
+        """x, y and altitude, m."""
+        return self.x, self.y, self.altitude
+
 
 def state_of(flight: np.ndarray, floor: float) -> QuadrotorState:
     """

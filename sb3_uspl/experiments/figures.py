@@ -208,8 +208,8 @@ def _first_of_each(experiment: Experiment, measured: list[tuple[Cell, dict]]) ->
 
 
 def _draw_belief(axis: Axes, time: np.ndarray, episode: dict[str, np.ndarray]) -> None:
-    """On the map if the task has one, else in privileged units."""
-    on_map = "map_centre" in episode
+    """On the map if the task has one with a place for all dimensions, else in privileged units."""
+    on_map = "map_centre" in episode and episode["map_centre"].shape[1] == episode["mean"].shape[1]
     centre, width = (episode["map_centre"], episode["map_half_widths"]) if on_map else (episode["mean"], episode["std"])
     truth = episode["map_truth"] if on_map else episode["truth"][0]
     for dim in range(centre.shape[1]):

@@ -148,6 +148,15 @@ def test_on_the_ground_the_readings_are_the_biases(env):
         assert observation["common"][3:7] == pytest.approx(0.0, abs=0.01)
 
 
+def test_the_position_is_where_it_is_and_not_what_is_read(env):
+    for seed in range(5):
+        observation, info = env.reset(seed=seed)
+        for _ in range(DECISIONS_IN_FLIGHT):
+            altitude = 4.0 * observation["common"][0] - 1.5 * observation["privileged"][0]
+            assert info["position"][2] == pytest.approx(altitude, abs=1e-5)
+            observation, _, _, _, info = env.step(DOWN)
+
+
 def test_a_fast_touchdown_is_a_crash_and_a_slow_one_is_not(env):
     task, robot = env.unwrapped.task, env.unwrapped.robot
     crashes = {True: 0, False: 0}

@@ -71,7 +71,7 @@ def test_random_steps_stay_in_the_spaces(env_id, env):
         assert np.isfinite(reward)
         assert reward == sum(info["reward_terms"].values())
         assert isinstance(info["is_success"], bool)
-        assert info["position"].shape == (2,) and info["position"].dtype == np.float32
+        assert info["position"].shape == (3 if "Quadrotor" in env_id else 2,) and info["position"].dtype == np.float32
         if terminated or truncated:
             observation, _ = env.reset()
 
