@@ -22,6 +22,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from sb3_uspl._configs import CONFIGS
+
 ROOT = Path(__file__).resolve().parents[1]
 TRAINED_AGENTS = ROOT / "trained_agents"
 EPISODES = 500
@@ -119,8 +121,17 @@ class Agent:
         first = self.settings / FIRST_ARGUMENTS
         if not given.get("trained_agent") or not first.is_file():
             return [self._command(given)]
-        model = f"logs/{self.algo}/{self.env}_1/{Path(given['trained_agent']).name}"
-        return [self._command(_read_settings(first)), self._command(given, f"-i {shlex.quote(model)}")]
+        return [
+            self._command(_read_settings(first)),
+            self._command(given, f"-i {shlex.quote(self.in_logs(given['trained_agent']))}"),
+        ]
+
+    def in_logs(self, model: str) -> str:
+        """
+        :param model: of an earlier training in this environment, somewhere
+        :return: where the README's commands leave it
+        """
+        return f"logs/{self.algo}/{self.env}_1/{Path(model).name}"
 
     def _command(self, given: dict[str, Any], *more: str) -> str:
         parts = ["python -m sb3_uspl.train", "--algo", self.algo, "--env", self.env, "--seed", str(given.get("seed")), *more]
@@ -167,10 +178,22 @@ def ship(run: Path, best: bool = False, folder: Path = TRAINED_AGENTS) -> Agent:
     (target / given.env).mkdir(parents=True, exist_ok=True)
     _ship_history(given, target)
     shutil.copy(model, target / given.model.name)
-    for path in (given.settings / ARGUMENTS, given.settings / "config.yml", given.settings / "vecnormalize.pkl"):
+    _ship_arguments(given, given.settings / ARGUMENTS, target / given.env / ARGUMENTS)
+    for path in (given.settings / "config.yml", given.settings / "vecnormalize.pkl"):
         if path.is_file():
             shutil.copy(path, target / given.env / path.name)
     return Agent(target)
+
+
+def _ship_arguments(run: Agent, source: Path, target: Path) -> None:
+    """A command line, with the README's paths instead of those of the machine that it was run on."""
+    arguments = yaml.unsafe_load(source.read_text())
+    arguments["log_folder"] = "logs"
+    if arguments.get("conf_file"):
+        arguments["conf_file"] = f"{CONFIGS.name}/{Path(arguments['conf_file']).name}"
+    if arguments.get("trained_agent"):
+        arguments["trained_agent"] = run.in_logs(arguments["trained_agent"])
+    target.write_text(yaml.dump(arguments))
 
 
 def _ship_history(run: Agent, target: Path) -> None:
@@ -181,7 +204,7 @@ def _ship_history(run: Agent, target: Path) -> None:
         first = Path(run.arguments()["trained_agent"]).parent
         if not (first / run.env / ARGUMENTS).is_file():
             raise ValueError(f"{run.folder} was trained on from {first}, where there is no {run.env}/{ARGUMENTS}.")
-        shutil.copy(first / run.env / ARGUMENTS, target / run.env / FIRST_ARGUMENTS)
+        _ship_arguments(run, first / run.env / ARGUMENTS, target / run.env / FIRST_ARGUMENTS)
         history.insert(0, first / PROGRESS)
     frames = [pd.read_csv(path) for path in history if path.is_file()]
     for before, after in itertools.pairwise(frames):

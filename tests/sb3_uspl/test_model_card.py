@@ -84,7 +84,14 @@ def test_what_is_shipped_is_what_was_asked_for(tmp_path):
 def test_an_agent_that_was_trained_on_is_shipped_with_both_commands_and_times(tmp_path):
     first = ship(write_agent(tmp_path / "logs").folder, folder=tmp_path / "agents")
     run = write_agent(tmp_path / "more")
-    arguments = {"seed": 8, "n_timesteps": 1000, "trained_agent": str(first.model), "hyperparams": {"gamma": 0.98}}
+    arguments = {
+        "seed": 8,
+        "n_timesteps": 1000,
+        "trained_agent": str(first.model),
+        "conf_file": str(tmp_path / "zoo_configs" / "uspl_ppo.yml"),
+        "log_folder": str(tmp_path / "more"),
+        "hyperparams": {"gamma": 0.98},
+    }
     (run.settings / "args.yml").write_text(yaml.dump(arguments))
     (run.folder / "progress.csv").write_text("time/total_timesteps,time/time_elapsed\n2001896,100\n")
     begun_with, last = first.commands()[0], ship(run.folder, folder=tmp_path / "agents")
@@ -94,6 +101,8 @@ def test_an_agent_that_was_trained_on_is_shipped_with_both_commands_and_times(tm
         begun_with,
         f"python -m sb3_uspl.train --algo uspl_ppo --env LateralChoice-v0 --seed 8 {model} -n 1000 -params gamma:0.98",
     ]
+    for settings in ("args.yml", "first_args.yml"):
+        assert str(tmp_path) not in (last.settings / settings).read_text(), "another machine has other paths"
     (first.settings / "args.yml").unlink()
     with pytest.raises(ValueError, match="trained on from"):
         ship(run.folder, folder=tmp_path / "elsewhere")
