@@ -149,8 +149,8 @@ class Figures:
         period = float(records["decision_period"])
         for episode, (above, below) in zip(shown, rows.T, strict=True):
             time = period * np.arange(len(episode["position"]))
-            for dim in range(episode["position"].shape[1]):
-                above.plot(time, episode["position"][:, dim], label=f"position {dim}")
+            for name, coordinate in zip("xyz", episode["position"].T, strict=False):
+                above.plot(time, coordinate, label=name)
             _draw_belief(below, time, episode)
             above.set_title("success" if episode["success"] else "no success", fontsize="small")
             below.set_xlabel("time (s)")
