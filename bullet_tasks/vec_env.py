@@ -1,12 +1,10 @@
-"""A vector environment that hosts several environments a process and moves observations through shared memory."""
+"""A vector environment that has several environments a process and moves observations through shared memory."""
 
 import contextlib
 import multiprocessing
 import os
-import pickle
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import gymnasium
@@ -16,23 +14,12 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 from bullet_tasks.infos import unpack
 from bullet_tasks.shared_arrays import SharedArrays
-from bullet_tasks.vec_worker import (
-    ACTION,
-    CLOSE,
-    DONE,
-    REWARD,
-    SINGLE_OBSERVATION,
-    EnvFns,
-    observation_array,
-    run_worker,
-)
-
-_LIVENESS_PERIOD = 1.0  # s between two looks at whether a silent worker still lives
-_CLOSE_TIMEOUT = 5.0  # s that a worker has to close its environments
+from bullet_tasks.vec_hosts import Host, HostHere, HostInWorker, WorkerDied
+from bullet_tasks.vec_worker import ACTION, DONE, REWARD, SINGLE_OBSERVATION, EnvFns, Reply, Request, observation_array
 
 
 class WorkerTraceback(Exception):
-    """The traceback of an error in a worker, shown as the cause of the error that is raised in the parent."""
+    """The traceback of an error in an environment, shown as the cause of the error that is raised."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -44,7 +31,7 @@ class WorkerTraceback(Exception):
 
 class BulletVecEnv(VecEnv):
     """
-    Several environments a worker process; observations, rewards, ends and actions go through shared memory.
+    Several environments a process, this one and workers; observations, rewards, ends and actions go through shared memory.
 
     SB3's ``SubprocVecEnv`` has one process an environment, which costs 0.2-0.3 ms a step each; that is more than a step
     of a small PyBullet world. Results are those of ``DummyVecEnv``, bit for bit. Works for any gymnasium environment with
@@ -56,8 +43,9 @@ class BulletVecEnv(VecEnv):
     the vector environment. After a KeyboardInterrupt it can be used again; the interrupted step is lost.
 
     :param env_fns: functions that make the environments
-    :param n_workers: number of processes; by default one a core that this process may use, at most one an environment
-    :param start_method: of ``multiprocessing``; by default ``"fork"`` where there is one, else ``"spawn"``
+    :param n_workers: number of processes at work, this one included; by default one a core that this process may use, at
+        most one an environment
+    :param start_method: of ``multiprocessing``, for the other ones; by default ``"fork"`` where there is one, else ``"spawn"``
     :raises ValueError: if the environments have spaces that are not supported or differ, or an argument is impossible
     """
 
@@ -80,12 +68,10 @@ class BulletVecEnv(VecEnv):
         if start_method not in known:
             raise ValueError(f"Unknown start_method {start_method!r}; known here: {known}.")
 
-        self._connections: list[Connection] = []
-        self._processes: list[Any] = []
+        self._hosts: list[Host] = []
         # Environments are dealt out in contiguous runs, so that a worker's part of every shared array is one slice.
         self._parts = [range(part[0], part[-1] + 1) for part in np.array_split(np.arange(len(env_fns)), n_workers)]
         self._home = [(worker, i - part[0]) for worker, part in enumerate(self._parts) for i in part]
-        self._awaited: set[int] = set()
         self._arrays: SharedArrays | None = None
         self.closed = False
         try:
@@ -100,25 +86,18 @@ class BulletVecEnv(VecEnv):
 
     def _start(self, env_fns: Sequence[Callable[[], gymnasium.Env]], start_method: str) -> None:
         context = multiprocessing.get_context(start_method)
-        for worker, part in enumerate(self._parts):
-            here, there = context.Pipe()
-            self._connections.append(here)
-            inherited = tuple(self._connections) if start_method == "fork" else ()
-            process = context.Process(  # type: ignore[attr-defined]
-                target=run_worker,
-                args=(there, inherited, EnvFns([env_fns[i] for i in part]), part[0]),
-                name=f"BulletVecEnv-{worker}",
-                daemon=True,
-            )
-            process.start()
-            self._processes.append(process)
-            # Only the worker may hold its end, or its death would go unnoticed.
-            there.close()
-            self._awaited.add(worker)
+        workers: list[HostInWorker] = []
+        # Workers first: a fork shall not copy the environments of this process, and all make theirs at the same time.
+        for worker, part in enumerate(self._parts[1:], 1):
+            connections = [other.connection for other in workers]
+            fns = EnvFns([env_fns[i] for i in part])
+            workers.append(HostInWorker(context, connections, fns, part[0], f"BulletVecEnv-{worker}"))
+            self._hosts.append(workers[-1])
+        self._hosts.insert(0, HostHere(EnvFns([env_fns[i] for i in self._parts[0]]), 0))
 
     def _common_spaces(self) -> tuple[spaces.Space, spaces.Space]:
         """The spaces of all environments, after a check that all have the same."""
-        replies = self._gather(range(len(self._parts)))
+        replies = self._gather(range(len(self._hosts)))
         all_spaces = [pair for worker in sorted(replies) for pair in replies[worker]]
         for index, pair in enumerate(all_spaces):
             if pair != all_spaces[0]:
@@ -153,37 +132,41 @@ class BulletVecEnv(VecEnv):
 
     # ------------------------------------------------------------------ messages
 
-    def _ask(self, requests: Mapping[int, tuple[str, tuple]], fatal: bool = False) -> dict[int, Any]:
-        """Send a request to each of some workers and wait for all replies."""
+    def _ask(self, requests: Mapping[int, Request], fatal: bool = False) -> dict[int, Any]:
+        """Send a request to each of some hosts and wait for all replies."""
         if self.waiting:
             raise RuntimeError("A step is under way: call step_wait() first.")
+        self._settle()
         self._post(requests)
         return self._gather(requests, fatal)
 
     def _ask_all(self, method: str, *arguments: Any) -> dict[int, Any]:
-        return self._ask(dict.fromkeys(range(len(self._parts)), (method, arguments)))
+        return self._ask(dict.fromkeys(range(len(self._hosts)), (method, arguments)))
 
-    def _post(self, requests: Mapping[int, tuple[str, tuple]]) -> None:
+    def _settle(self) -> None:
+        """Throw away what is left over from an exchange that a KeyboardInterrupt broke off."""
         if self.closed:
             raise RuntimeError("This BulletVecEnv is closed; make a new one.")
-        # Left over from an exchange that a KeyboardInterrupt broke off.
-        for worker in sorted(self._awaited):
-            self._receive(worker)
+        for worker, host in enumerate(self._hosts):
+            if host.owes_reply:
+                self._receive(worker)
+
+    def _post(self, requests: Mapping[int, Request]) -> None:
         for worker, request in requests.items():
             try:
-                self._connections[worker].send(request)
-            except OSError:
-                self._bury(worker)
-            self._awaited.add(worker)
+                self._hosts[worker].post(request)
+            except WorkerDied as death:
+                self._bury(worker, death)
 
-    def _gather(self, workers: Sequence[int] | Mapping[int, Any], fatal: bool = True) -> dict[int, Any]:
+    def _gather(self, workers: Iterable[int], fatal: bool = True) -> dict[int, Any]:
         """
-        Wait for the replies of some workers; if one is an error, raise it after all have come.
+        Wait for the replies of some hosts; if one is an error, raise it after all have come.
 
         :param workers: indices
         :param fatal: whether an error closes the vector environment
         """
-        replies = {worker: self._receive(worker) for worker in workers}
+        # This process does its own part first: the others are at theirs.
+        replies = {worker: self._receive(worker) for worker in sorted(workers)}
         for succeeded, result in replies.values():
             if not succeeded:
                 error, text = result
@@ -194,27 +177,18 @@ class BulletVecEnv(VecEnv):
                 raise error from WorkerTraceback(text)
         return {worker: result for worker, (_, result) in replies.items()}
 
-    def _receive(self, worker: int) -> tuple[bool, Any]:
-        connection, process = self._connections[worker], self._processes[worker]
+    def _receive(self, worker: int) -> Reply:
         try:
-            while not connection.poll(_LIVENESS_PERIOD):
-                # A reply sent just before the end still counts, hence the second look.
-                if not process.is_alive() and not connection.poll(0):
-                    self._bury(worker)
-            reply = connection.recv_bytes()
-        except (EOFError, OSError):
-            self._bury(worker)
-        self._awaited.discard(worker)
-        return pickle.loads(reply)
+            return self._hosts[worker].receive()
+        except WorkerDied as death:
+            self._bury(worker, death)
 
-    def _bury(self, worker: int) -> NoReturn:
+    def _bury(self, worker: int, death: WorkerDied) -> NoReturn:
         """Close everything because a worker died, and say so."""
-        process, part = self._processes[worker], self._parts[worker]
-        process.join(_CLOSE_TIMEOUT)
-        code = process.exitcode
         self.close()
+        part = self._parts[worker]
         raise RuntimeError(
-            f"Worker {worker} with environments {part[0]} to {part[-1]} died (exit code {code}; negative: ended by that "
+            f"Worker {worker} with environments {part[0]} to {part[-1]} died (exit code {death}; negative: ended by that "
             "signal, -9 often means that memory ran out). The vector environment is closed."
         ) from None
 
@@ -228,7 +202,7 @@ class BulletVecEnv(VecEnv):
             for worker, part in enumerate(self._parts)
         }
         replies = self._ask(requests, fatal=True)
-        self.reset_infos = [info for worker in range(len(self._parts)) for info in replies[worker]]
+        self.reset_infos = [info for worker in range(len(self._hosts)) for info in replies[worker]]
         self._reset_seeds()
         self._reset_options()
         return self._copied_observations()
@@ -250,8 +224,9 @@ class BulletVecEnv(VecEnv):
             raise ValueError(f"Actions must have shape {shared.shape}, got {actions.shape}.")
         if not np.can_cast(actions.dtype, shared.dtype, casting="same_kind"):
             raise ValueError(f"Actions must be of a type that fits into {shared.dtype}, got {actions.dtype}.")
+        self._settle()
         np.copyto(shared, actions, casting="same_kind")
-        self._post(dict.fromkeys(range(len(self._parts)), ("step", ())))
+        self._post(dict.fromkeys(range(len(self._hosts)), ("step", ())))
         self.waiting = True
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -260,7 +235,7 @@ class BulletVecEnv(VecEnv):
             raise RuntimeError("No step is under way: call step_async() first.")
         # Before the wait: after a KeyboardInterrupt no step is under way any more, only replies to throw away.
         self.waiting = False
-        replies = self._gather(range(len(self._parts)))
+        replies = self._gather(range(len(self._hosts)))
         infos: list[dict[str, Any]] = []
         for worker, part in enumerate(self._parts):
             part_infos, reset_infos = replies[worker]
@@ -354,22 +329,12 @@ class BulletVecEnv(VecEnv):
             return
         self.closed = True
         self.waiting = False
-        for connection in self._connections:
-            with contextlib.suppress(OSError, ValueError):
-                connection.send((CLOSE, ()))
-            # Hanging up frees a worker that waits for room to send a reply that nobody will read.
-            connection.close()
-        for process in self._processes:
-            process.join(_CLOSE_TIMEOUT)
-            if process.is_alive():
-                process.terminate()
-                process.join(_CLOSE_TIMEOUT)
-            if process.is_alive():
-                process.kill()
-                process.join()
-            process.close()
-        self._processes.clear()
-        self._connections.clear()
+        for host in self._hosts:
+            host.hang_up()
+        # Workers first: whatever an environment's `close` does in this process, they are gone.
+        for host in reversed(self._hosts):
+            host.join()
+        self._hosts.clear()
         if self._arrays is not None:
             self._arrays.unlink()
             self._arrays = None

@@ -22,6 +22,11 @@ SINGLE_OBSERVATION = "observation"
 CLOSE = "close"
 """Request that has no reply."""
 
+Request = tuple[str, tuple[Any, ...]]
+"""A method of ``EnvHost`` and its arguments."""
+Reply = tuple[bool, Any]
+"""``(True, result)`` or ``(False, (error or None, traceback))``."""
+
 
 def observation_array(key: str) -> str:
     """
@@ -51,7 +56,7 @@ class EnvFns:
 
 class EnvHost:
     """
-    The environments of one worker. Public methods are the requests that it serves.
+    The environments of one process. Public methods are the requests that it serves.
 
     :param env_fns: make the environments
     :param first: index of the first of them among all
@@ -72,6 +77,18 @@ class EnvHost:
         self._arrays: SharedArrays | None = None
         self._actions = self._rewards = self._dones = np.zeros(0)
         self._observations: list[tuple[str | None, np.ndarray]] = []
+
+    def serve(self, request: Request) -> Reply:
+        """
+        Whatever happens, there is a reply.
+
+        :param request: to serve
+        """
+        method, arguments = request
+        try:
+            return True, getattr(self, method)(*arguments)
+        except Exception as error:
+            return _failure(error)
 
     def env_spaces(self) -> list[tuple[spaces.Space, spaces.Space]]:
         """Observation and action space of every environment."""
@@ -194,7 +211,7 @@ def _is_wrapped(env: gymnasium.Env, wrapper_class: type[gymnasium.Wrapper]) -> b
     return False
 
 
-def _failure(error: BaseException) -> tuple[bool, tuple[BaseException | None, str]]:
+def _failure(error: BaseException) -> Reply:
     """A reply that tells of an error; the error itself comes along if it survives the way."""
     text = traceback.format_exc()
     try:
@@ -206,7 +223,7 @@ def _failure(error: BaseException) -> tuple[bool, tuple[BaseException | None, st
 
 def run_worker(connection: Connection, inherited: Sequence[Connection], env_fns: EnvFns, first: int) -> None:
     """
-    Serve requests ``(method of EnvHost, arguments)`` with replies ``(True, result)`` or ``(False, (error, traceback))``.
+    Serve a parent's requests until it hangs up.
 
     :param connection: to the parent
     :param inherited: the parent's connections that a fork copied, which would keep other workers alive after the parent
@@ -226,12 +243,13 @@ def run_worker(connection: Connection, inherited: Sequence[Connection], env_fns:
             connection.send(_failure(error))
             return
         while True:
-            method, arguments = connection.recv()
-            if method == CLOSE:
+            request = connection.recv()
+            if request[0] == CLOSE:
                 return
             try:
-                reply = pickle.dumps((True, getattr(host, method)(*arguments)))
+                reply = pickle.dumps(host.serve(request))
             except Exception as error:
+                # The result does not survive the way.
                 reply = pickle.dumps(_failure(error))
             connection.send_bytes(reply)
     except (EOFError, OSError):

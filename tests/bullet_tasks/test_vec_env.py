@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import gymnasium
@@ -251,11 +252,14 @@ def test_no_pictures_without_a_render_mode(env):
         assert env.get_images() == [None] * N_ENVS
 
 
-def test_an_error_in_a_step_is_raised_here_with_its_traceback_and_closes():
-    env = BulletVecEnv([*toys(3), functools.partial(ToyEnv, number=3, fail_at=2)], n_workers=2)
+@pytest.mark.parametrize("number", [0, 3])
+def test_an_error_in_a_step_is_raised_here_with_its_traceback_and_closes(number):
+    env_fns = toys(4)
+    env_fns[number] = functools.partial(ToyEnv, number=number, fail_at=2)
+    env = BulletVecEnv(env_fns, n_workers=2)
     env.reset()
     # The number of steps counts within an episode, so it may end a few times before the failure.
-    with pytest.raises(OSError, match="number 3 is on fire") as caught:
+    with pytest.raises(OSError, match=f"number {number} is on fire") as caught:
         for _ in range(100):
             env.step(actions(env))
     assert isinstance(caught.value.__cause__, WorkerTraceback)
@@ -274,9 +278,10 @@ def test_a_worker_that_dies_is_reported():
 
 
 def test_a_worker_that_is_killed_between_steps_is_reported(env):
-    os.kill(env._processes[0].pid, signal.SIGKILL)
-    env._processes[0].join()
-    with pytest.raises(RuntimeError, match=r"Worker 0 .*exit code -9"):
+    (worker,) = multiprocessing.active_children()
+    os.kill(worker.pid, signal.SIGKILL)
+    worker.join()
+    with pytest.raises(RuntimeError, match=r"Worker 1 .*exit code -9"):
         env.step(actions(env))
 
 
@@ -284,28 +289,28 @@ def fail():
     raise FileNotFoundError("no such robot")
 
 
-def test_an_error_at_construction_is_raised_here():
+@pytest.mark.parametrize("place", [0, 2])
+def test_an_error_at_construction_is_raised_here(place):
+    env_fns = toys(2)
+    env_fns.insert(place, fail)
     with pytest.raises(FileNotFoundError, match="no such robot"):
-        BulletVecEnv([*toys(2), fail], n_workers=2)
+        BulletVecEnv(env_fns, n_workers=2)
 
 
-def test_an_interrupted_step_is_lost_and_no_more(monkeypatch):
-    env = BulletVecEnv(toys(4, slow=0.05), n_workers=2)
+# While this process does its part of the step; while it waits for the worker.
+@pytest.mark.parametrize(("seconds", "slow"), [(0.03, 0.05), (0.03, 0.0)])
+def test_an_interrupted_step_is_lost_and_no_more(seconds, slow):
+    env_fns = [*toys(2, slow=slow), *(functools.partial(ToyEnv, number=i, slow=0.1) for i in (2, 3))]
+    env = BulletVecEnv(env_fns, n_workers=2)
     reference = DummyVecEnv(toys(4))
     for vec_env in (env, reference):
         vec_env.seed(0)
         vec_env.reset()
-    original = env._receive
-
-    def interrupted(worker):
-        if worker == 1:
-            raise KeyboardInterrupt
-        return original(worker)
-
-    monkeypatch.setattr(env, "_receive", interrupted)
+    alarm = threading.Timer(seconds, os.kill, [os.getpid(), signal.SIGINT])
+    alarm.start()
     with pytest.raises(KeyboardInterrupt):
         env.step(actions(env))
-    monkeypatch.undo()
+    alarm.join()
     reference.step(actions(env))
     assert_same(list(env.step(actions(env))), list(reference.step(actions(env))))
     env.close()
@@ -332,10 +337,10 @@ def test_closing_is_idempotent_and_possible_during_a_step():
 
 
 def test_dropping_it_ends_its_workers():
-    env = BulletVecEnv(toys(2))
-    processes = [process.pid for process in env._processes]
+    env = BulletVecEnv(toys(2), n_workers=2)
+    assert multiprocessing.active_children()
     del env
-    assert processes and not multiprocessing.active_children()
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize("bad", [np.zeros(4, int), np.zeros((5, 1), int), 0])
@@ -374,10 +379,9 @@ def test_one_environment_for_two_is_refused():
         BulletVecEnv([lambda: shared] * 2, n_workers=1)
 
 
-def test_default_number_of_workers():
-    env = BulletVecEnv(toys(1))
-    assert len(env._processes) == 1
-    env.close()
-    env = BulletVecEnv(toys(3))
-    assert 1 <= len(env._processes) <= 3
+@pytest.mark.parametrize(("cores", "n_envs", "n_others"), [(1, 3, 0), (2, 3, 1), (8, 3, 2), (2, 1, 0)])
+def test_by_default_every_core_has_a_process_and_this_one_is_among_them(monkeypatch, cores, n_envs, n_others):
+    monkeypatch.setattr("bullet_tasks.vec_env._cores", lambda: cores)
+    env = BulletVecEnv(toys(n_envs))
+    assert len(multiprocessing.active_children()) == n_others
     env.close()
