@@ -310,8 +310,17 @@ def test_an_error_at_construction_is_raised_here(place):
         BulletVecEnv(env_fns, n_workers=2)
 
 
+@pytest.fixture
+def ctrl_c_interrupts():
+    """A job in the background of a shell is born deaf to it."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
 # In this process, which is in the middle of a step then; in a worker, for which it waits.
 @pytest.mark.parametrize("place", [0, 3])
+@pytest.mark.usefixtures("ctrl_c_interrupts")
 def test_an_interrupted_step_is_lost_and_no_more(place):
     env_fns = toys(4)
     env_fns[place] = functools.partial(ToyEnv, number=place, interrupts=os.getpid())
