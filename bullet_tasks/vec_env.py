@@ -93,7 +93,7 @@ class BulletVecEnv(VecEnv):
             fns = EnvFns([env_fns[i] for i in part])
             workers.append(HostInWorker(context, connections, fns, part[0], f"BulletVecEnv-{worker}"))
             self._hosts.append(workers[-1])
-        self._hosts.insert(0, HostHere(EnvFns([env_fns[i] for i in self._parts[0]]), 0))
+        self._hosts.insert(0, HostHere([env_fns[i] for i in self._parts[0]]))
 
     def _common_spaces(self) -> tuple[spaces.Space, spaces.Space]:
         """The spaces of all environments, after a check that all have the same."""

@@ -4,9 +4,11 @@ import contextlib
 import pickle
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn, Protocol
+
+import gymnasium
 
 from bullet_tasks.vec_worker import CLOSE, EnvFns, EnvHost, Reply, Request, run_worker
 
@@ -50,13 +52,12 @@ class HostHere:
     """
     Environments in this process. Its work is done in ``receive``, while those in other processes are at theirs.
 
-    :param env_fns: make the environments
-    :param first: index of the first of them among all
+    :param env_fns: make the environments, the first of all
     """
 
-    def __init__(self, env_fns: EnvFns, first: int) -> None:
+    def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env]]) -> None:
         self.owes_reply = True
-        self._host = EnvHost(env_fns.env_fns, first)
+        self._host = EnvHost(env_fns, 0)
         self._request: Request = ("env_spaces", ())
 
     def post(self, request: Request) -> None:
