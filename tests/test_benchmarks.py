@@ -74,21 +74,34 @@ def test_a_section_that_fails_costs_no_other_its_results(tmp_path, monkeypatch, 
     def broken():
         raise RuntimeError("no such luck")
 
-    sections = {
-        "broken": (broken, {}),
-        "fine": (
-            lambda size: {"Fine": [{"size": size}], harness.TARGETS: [harness.target("t", 1.0, at_most=2.0)]},
-            {"size": 1},
-        ),
-    }
-    monkeypatch.setattr(command_line, "SECTIONS", sections)
+    def fine(size):
+        return {"Fine": [{"size": size}], harness.TARGETS: [harness.target("t", 1.0, at_most=2.0)]}
+
+    monkeypatch.setattr(command_line, "SECTIONS", {"broken": (broken, {}), "fine": (fine, {"size": 1})})
     path = tmp_path / "folder" / "results.json"
     assert not command_line.run_sections(["broken", "fine"], True, {"size": None, "threads": 3}, path)
-    content = json.loads(path.read_text())
-    assert "no such luck" in content["sections"]["broken"]["failed"]
-    assert content["sections"]["fine"]["tables"]["Fine"] == [{"size": 1}]
-    assert {"processor", "cores", "packages", "commit", "load"} <= set(content["machine"])
+    sections = json.loads(path.read_text())["sections"]
+    assert "no such luck" in sections["broken"]["failed"]
+    assert sections["fine"]["tables"]["Fine"] == [{"size": 1}]
+    assert {"processor", "cores", "packages", "commit", "load"} <= set(sections["fine"]["machine"])
     assert "Targets" in capsys.readouterr().out
+
+
+def test_what_is_not_measured_again_stays(tmp_path, monkeypatch, capsys):
+    def first():
+        return {"First": [{"speed": 12.0}], harness.TARGETS: [harness.target("old target", 1.0, at_most=2.0)]}
+
+    monkeypatch.setattr(command_line, "SECTIONS", {"first": (first, {}), "second": (lambda: {"Second": [{"n": 1}]}, {})})
+    path = tmp_path / "results.json"
+    assert command_line.run_sections(["first"], False, {}, path)
+    before = json.loads(path.read_text())["sections"]["first"]
+    capsys.readouterr()
+    assert command_line.run_sections(["second"], False, {}, path)
+    assert json.loads(path.read_text())["sections"]["first"] == before
+    assert "old target" not in capsys.readouterr().out  # of what was not measured now
+    command_line.show_sections(path)
+    shown = capsys.readouterr().out
+    assert "old target" in shown and "12" in shown and shown.index("First") < shown.index("Second")
 
 
 # -- phases ------------------------------------------------------------------------------------------------------------------
