@@ -163,7 +163,8 @@ class UncertaintyVecWrapper(VecEnvWrapper):
 
     Returned observations hold what the actor sees (``common``, blurred ``privileged``, ``uncertainty``, ``belief``), what only
     the critic sees (``truth``) and what the encoder learns from (``target``, ``previous_action``, ``episode_step``).
-    ``terminal_observation`` is encoded with the memory from before the reset. Rewards are scaled with the uncertainty that the
+    ``terminal_observation`` of an episode that was cut short is encoded with the memory from before the reset; where an episode
+    really ended, nobody asks what its last observation was worth, and it stays the environment's. Rewards are scaled with the uncertainty that the
     action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations; with
     ``mismatch_hold``, each draws another one after a random time, whose mean is spread log-uniformly over that range, so that
     the encoder sees the behaviour of the undecided and of those who change their mind before the policy has learned either.
@@ -187,12 +188,12 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         self.noise = BlurNoise(self.num_envs, space.shape[0], config, self.rng)
         self.metrics: dict[str, list[float]] = defaultdict(list)
         self._shape = (self.num_envs, space.shape[0])
-        self._matched = np.arange(self.num_envs) < self.num_envs - config.n_mismatched
+        self._n_matched = self.num_envs - config.n_mismatched
         if config.mismatch_hold is not None:
             self._redraw_rate = 1.0 / np.geomspace(*config.mismatch_hold, config.n_mismatched)
         self._wandering = None
         if config.wander_share > 0.0:
-            share = np.where(self._matched, 0.0, config.wander_share)
+            share = np.where(np.arange(self.num_envs) < self._n_matched, 0.0, config.wander_share)
             self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng, config.wander_actions)
 
     def reset(self) -> VecEnvObs:
@@ -216,7 +217,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
 
     def redraw_mismatch(self) -> None:
         """Draw anew which mismatched environment sees whose privileged observation; never its own."""
-        order = self.rng.permutation(np.flatnonzero(~self._matched))
+        order = self.rng.permutation(np.arange(self._n_matched, self.num_envs))
         self._source = np.arange(self.num_envs)
         self._source[order] = np.roll(order, 1)
 
@@ -224,7 +225,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
         """Show some mismatched environments another one's privileged observation from now on; never their own."""
         n = self.config.n_mismatched
         due = np.flatnonzero(self.rng.uniform(size=n) < self._redraw_rate)
-        first = self.num_envs - n
+        first = self._n_matched
         self._source[first + due] = first + (due + self.rng.integers(1, n, len(due))) % n
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -240,11 +241,11 @@ class UncertaintyVecWrapper(VecEnvWrapper):
             config = self.config
             scale = reward_coefficient(self.std, self.progress, config.c_min, config.c_max, config.delta)
             rewards = (rewards * scale).astype(np.float32)
-            self.metrics["reward_scale"].append(float(scale[self._matched].mean()))
+            self.metrics["reward_scale"].append(float(scale[: self._n_matched].mean()))
         self.step_count += 1
         rows = np.flatnonzero(dones)
         if len(rows):
-            self._rewrite_terminal(rows, infos)
+            self._rewrite_terminal(rows[[infos[row].get("TimeLimit.truncated", False) for row in rows]], infos)
             reset_rows(self.memory, th.as_tensor(rows, device=self.device))
             # A new array: the last observation, which PPO has yet to store, holds the old one.
             self.std = np.where(dones[:, None], np.float32(INITIAL_STD), self.std)
@@ -281,14 +282,16 @@ class UncertaintyVecWrapper(VecEnvWrapper):
             out[TARGET] = obs[TARGET]
         if self._wandering is not None:
             self._wandering.advance()
-        matched = self._matched
-        self.metrics["uncertainty"].append(float(self.std[matched].mean()))
-        self.metrics["prediction_error"].append(float(np.abs(mean - obs[PRIVILEGED])[matched].mean()))
-        self.metrics["blur"].append(float(np.abs(shown - obs[PRIVILEGED])[matched].mean()))
+        n, truth = self._n_matched, obs[PRIVILEGED]
+        self.metrics["uncertainty"].append(float(self.std[:n].mean()))
+        self.metrics["prediction_error"].append(float(np.abs(mean[:n] - truth[:n]).mean()))
+        self.metrics["blur"].append(float(np.abs(shown[:n] - truth[:n]).mean()))
         return out
 
     def _rewrite_terminal(self, rows: np.ndarray, infos: list[dict]) -> None:
-        """Encode the last observations of ended episodes with the history that they belong to."""
+        """Encode the last observations of episodes that were cut short with the history that they belong to."""
+        if len(rows) == 0:
+            return
         last = {key: np.stack([infos[i]["terminal_observation"][key] for i in rows]) for key in self.observation_space.spaces}  # type: ignore[attr-defined]
         check_finite(last)
         with th.no_grad():
