@@ -122,7 +122,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small sizes, once: whether it runs, not how fast")
     parser.add_argument("--repetitions", type=int, help="rounds of every comparison (5)")
     parser.add_argument("--threads", type=int, help="of torch (1), where they are not compared")
-    parser.add_argument("--json", type=Path, default=ROOT / "benchmarks" / "results.json", help="file to write; what is not measured stays in it")
+    results = ROOT / "benchmarks" / "results.json"
+    parser.add_argument("--json", type=Path, default=results, help="file to write; what is not measured stays in it")
     parser.add_argument("--markdown", action="store_true", help="print tables as Markdown")
     parser.add_argument("--show", action="store_true", help="print what the file holds, measure nothing")
     options = parser.parse_args()

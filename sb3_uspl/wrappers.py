@@ -162,12 +162,15 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     Runs the encoder beside the environments (Alg. 1, lines 5-10).
 
     Returned observations hold what the actor sees (``common``, blurred ``privileged``, ``uncertainty``, ``belief``), what only
-    the critic sees (``truth``) and what the encoder learns from (``target``, ``previous_action``, ``episode_step``).
-    ``terminal_observation`` of an episode that was cut short is encoded with the memory from before the reset; where an episode
-    really ended, nobody asks what its last observation was worth, and it stays the environment's. Rewards are scaled with the uncertainty that the
-    action was chosen under. The last ``n_mismatched`` environments are shown each other's privileged observations; with
-    ``mismatch_hold``, each draws another one after a random time, whose mean is spread log-uniformly over that range, so that
-    the encoder sees the behaviour of the undecided and of those who change their mind before the policy has learned either.
+    the critic sees (``truth``) and what the encoder learns from (``target``, ``previous_action``, ``episode_step``). Rewards
+    are scaled with the uncertainty that the action was chosen under.
+
+    ``terminal_observation`` of an episode that was cut short is encoded with the memory from before the reset. Where one
+    really ended, nobody asks what its last observation was worth, and it stays the environment's.
+
+    The last ``n_mismatched`` environments are shown each other's privileged observations; with ``mismatch_hold``, each draws
+    another one after a random time, whose mean is spread log-uniformly over that range, so that the encoder sees the behaviour
+    of the undecided and of those who change their mind before the policy has learned either.
 
     :param venv: environments under the observation contract
     :param encoder: observation encoder

@@ -61,6 +61,23 @@ def test_every_belief_comes_from_its_own_episode(memory):
             assert obs["episode_step"][i] == len(history[i]) - 1
 
 
+def test_only_what_was_cut_short_has_its_end_encoded():
+    wrapper = make_wrapper(2)
+    ending = wrapper.venv.envs[0]
+    cut = ending.step
+    ending.step = lambda action: (*(result := cut(action))[:2], result[3], False, result[4])  # time is up: a real end
+    wrapper.reset()
+    dones = np.zeros(2, dtype=bool)
+    while not dones.any():
+        obs, _, dones, infos = wrapper.step(np.ones((2, 1), np.float32))
+    assert dones.all() and [info["TimeLimit.truncated"] for info in infos] == [False, True]
+    assert set(infos[0]["terminal_observation"]) == set(wrapper.observation_space.spaces)
+    assert set(infos[1]["terminal_observation"]) == set(POLICY_KEYS)
+    for i in range(2):  # both begin anew
+        mean, _ = beliefs_from_scratch(wrapper.encoder, [(obs["common"][i], np.zeros(1, np.float32))])
+        np.testing.assert_allclose(obs["belief"][i], mean, atol=1e-5)
+
+
 def test_smoothing_starts_wide_and_is_reset_with_the_episode():
     wrapper, raw = make_wrapper(2, smoothing=0.8), make_wrapper(2)
     obs, sharp = wrapper.reset(), raw.reset()
