@@ -108,8 +108,9 @@ def show_sections(path: Path, markdown: bool = False) -> None:
     sections = read_sections(path)
     show_targets(sections, markdown)
     for name, section in sections.items():
-        machine = section["machine"]
-        print(f"\n{name}: {machine['time']}, commit {machine['commit']}, {machine['processor']}, {machine['cores']} cores")
+        machine, quick = section["machine"], ", quick" * section["quick"]
+        on = f"{machine['processor']}, {machine['cores']} cores"
+        print(f"\n{name}: {machine['time']}, commit {machine['commit']}, {on}{quick}")
         for title, table in section.get("tables", {}).items():
             if title != TARGETS:
                 print("\n" + show(title, table, markdown))
@@ -131,6 +132,8 @@ def main() -> None:
     if unknown:
         parser.error(f"unknown sections {unknown}; known: {list(SECTIONS)}")
     if options.show:
+        if not options.json.exists():
+            parser.error(f"nothing to show: no file {options.json}")
         return show_sections(options.json, options.markdown)
     overrides = {"repetitions": options.repetitions, "threads": options.threads}
     if not run_sections(options.sections or list(SECTIONS), options.quick, overrides, options.json, options.markdown):
