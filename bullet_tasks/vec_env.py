@@ -222,6 +222,8 @@ class BulletVecEnv(VecEnv):
         actions = np.asarray(actions)
         if actions.shape != shared.shape:
             raise ValueError(f"Actions must have shape {shared.shape}, got {actions.shape}.")
+        if isinstance(self.action_space, spaces.MultiBinary):
+            actions = actions.astype(shared.dtype)  # SB3's policies say 0.0 and 1.0
         if not np.can_cast(actions.dtype, shared.dtype, casting="same_kind"):
             raise ValueError(f"Actions must be of a type that fits into {shared.dtype}, got {actions.dtype}.")
         self._settle()

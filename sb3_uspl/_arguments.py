@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -10,7 +10,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_uspl.buffers import USPLRolloutBuffer
-from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space
+from sb3_uspl.observations import COMMON, PRIVILEGED, check_normalization, check_observation_space
 from sb3_uspl.policies import USPLPolicy
 from sb3_uspl.symmetries import Symmetry, SymmetryGroup
 
@@ -29,6 +29,8 @@ def check_arguments(model: "USPLPPO") -> None:
     :raises ValueError: for a space outside the contract or an argument outside its range, naming what to do
     """
     space = check_observation_space(model.observation_space)[PRIVILEGED]
+    if model.env is not None:
+        check_normalization(model.env)
     assert isinstance(space, spaces.Box)
     if not issubclass(model.policy_class, USPLPolicy):
         raise ValueError(f"USPLPPO needs a subclass of sb3_uspl.USPLPolicy as policy; {model.policy_class} was given.")
@@ -40,9 +42,10 @@ def check_arguments(model: "USPLPPO") -> None:
     for dim, values in model.discrete_privileged.items():
         if not 0 <= dim < space.shape[0]:
             raise ValueError(f"discrete_privileged names dimension {dim}, but the privileged observation has {space.shape[0]}")
-        if len(set(values)) < 2 or min(values) < space.low[dim] - 1e-6 or max(values) > space.high[dim] + 1e-6:
+        distinct = 1 < len(values) == len(set(values))
+        if not distinct or min(values) < space.low[dim] - 1e-6 or max(values) > space.high[dim] + 1e-6:
             raise ValueError(
-                f"discrete_privileged={{{dim}: {values}}}: give at least two different values within the bounds "
+                f"discrete_privileged={{{dim}: {values}}}: give two values or more, each once, within the bounds "
                 f"[{space.low[dim]}, {space.high[dim]}] of that dimension."
             )
     continuous = [dim for dim in range(space.shape[0]) if dim not in model.discrete_privileged]
@@ -75,6 +78,8 @@ def check_arguments(model: "USPLPPO") -> None:
         "context_length": (model.context_length, 1, np.inf),
         "encoder_window": (1 if model.encoder_window is None else model.encoder_window, 1, np.inf),
         "encoder_window_timesteps": (model.encoder_window_timesteps or 0, 0, np.inf),
+        "encoder_max_grad_norm": (model.encoder_max_grad_norm, 1e-12, np.inf),
+        "replay_bytes": (model.replay_bytes, 0, np.inf),
         "encoder_beta": (model.encoder_beta, 0, 1),
         "wander_share": (model.wander_share, 0, 1),
         "mismatch_fraction": (model.mismatch_fraction or 0.0, 0, 0.9),
@@ -103,19 +108,47 @@ def checked_wander_actions(chosen: dict[int, float] | None, space: spaces.Space)
     return chosen
 
 
-def count_mismatched(fraction: float | None, n_envs: int) -> int:
+def check_policy_kwargs(given: dict[str, Any], derived: dict[str, Any]) -> None:
+    """
+    Refuse what would be replaced without a word.
+
+    :param given: by the user
+    :param derived: from the algorithm's own arguments
+    :raises ValueError: naming what to do
+    """
+    both = sorted(given.keys() & derived.keys())
+    if both:
+        raise ValueError(
+            f"policy_kwargs sets {both}, which USPLPPO derives from arguments of its own: give uncertainty_input, mean_input, "
+            "discrete_privileged, smoothing_time, symmetries, action_noise_time, encoder_learning_rate, encoder_weight_decay "
+            "to USPLPPO itself."
+        )
+
+
+def count_mismatched(model: "USPLPPO", lenient: bool = False) -> int:
     """
     How many environments are shown another one's privileged observation.
 
-    :param fraction: of the environments; None: a quarter, or none with a warning if that is no pair
-    :param n_envs: number of environments
-    :raises ValueError: if a fraction that was asked for is no pair
+    :param model: with its ``mismatch_fraction``; None: a quarter, or none with a warning if that is no pair
+    :param lenient: whether to do without if the environments are too few, and not to say so
+    :raises ValueError: if a fraction that was asked for is no pair, or leaves no environment to PPO
     """
-    automatic = fraction is None
-    fraction = 0.25 if fraction is None else fraction
+    n_envs, automatic = model.n_envs, model.mismatch_fraction is None
+    fraction = 0.25 if model.mismatch_fraction is None else model.mismatch_fraction
     count = round(fraction * n_envs)
-    if fraction == 0.0 or count >= 2:
+    if 2 <= count < n_envs:
         return count
+    if lenient:
+        return 0
+    if model.wander_share > 0.0 and count < 2:
+        warnings.warn(f"wander_share={model.wander_share} has no effect: only mismatched environments wander; there are none.")
+    if fraction == 0.0:
+        return 0
+    if count >= 2:
+        raise ValueError(
+            f"mismatch_fraction={fraction} of {n_envs} environments leaves none whose episodes PPO learns from: use more "
+            "environments or a smaller fraction."
+        )
     needed = int(np.ceil(1.5 / fraction))
     if automatic:
         warnings.warn(
@@ -193,11 +226,6 @@ def ask_decision_period(env: VecEnv | None, given: float | None) -> float:
     :param env: asked if nothing is given
     :param given: what the user says
     """
-    if given is not None:
-        return given
-    if env is not None:
-        try:
-            return float(env.get_attr("decision_period", indices=[0])[0])
-        except AttributeError:
-            pass
-    return PAPER_DECISION_PERIOD
+    if given is None and env is not None and env.has_attr("decision_period"):
+        given = float(env.get_attr("decision_period", indices=[0])[0])
+    return PAPER_DECISION_PERIOD if given is None else given

@@ -161,9 +161,13 @@ def check_names(algo: str, env_id: str) -> None:
 
 
 def _value_of(*names: str) -> str | None:
-    """What follows an option on the command line."""
-    argv = sys.argv
-    return next((argv[i + 1] for i in range(1, len(argv) - 1) if argv[i] in names), None)
+    """What an option on the command line says, "--option value" or "--option=value"; the last one counts, as in argparse."""
+    value = None
+    for argument, following in itertools.pairwise([*sys.argv[1:], ""]):
+        name, equals, text = argument.partition("=")
+        if name in names:
+            value = text if equals else following
+    return value
 
 
 def check_command_line() -> None:
@@ -199,15 +203,12 @@ def _after(name: str) -> list[str]:
 
 def use_default_folder() -> None:
     """Add ``-f trained_agents`` to the command line unless it names a folder."""
-    if not {"-f", "--folder"} & set(sys.argv):
+    if _value_of("-f", "--folder") is None:
         sys.argv += ["-f", str(TRAINED_AGENTS)]
 
 
 def use_default_config() -> None:
     """Add ``-conf zoo_configs/<algo>.yml`` to the command line unless it names a configuration."""
-    argv = sys.argv
-    if {"-conf", "--conf-file"} & set(argv) or "--algo" not in argv[:-1]:
-        return
-    config = CONFIGS / f"{argv[argv.index('--algo') + 1]}.yml"
-    if config.is_file():
+    config = CONFIGS / f"{_value_of('--algo')}.yml"
+    if _value_of("-conf", "--conf-file") is None and config.is_file():
         sys.argv += ["-conf", str(config)]

@@ -237,7 +237,9 @@ class _TransformerStep(nn.Module):
 
 
 def _frozen_copy(policy: nn.Module) -> Any:
-    return copy.deepcopy(policy).to("cpu").requires_grad_(False)
+    bare = copy.copy(policy)
+    del bare.action_dist  # not needed, and it may hold tensors of PPO's last update, which cannot be copied
+    return copy.deepcopy(bare).to("cpu").requires_grad_(False)
 
 
 def _as_function(memory: Memory, horizon: int) -> _GRUStep | _MaxStep | _TransformerStep:

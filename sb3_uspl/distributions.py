@@ -23,6 +23,14 @@ class CorrelatedGaussianDistribution(DiagGaussianDistribution):
         self.correlation = correlation
         self.noise: th.Tensor | None = None
 
+    def independent(self) -> DiagGaussianDistribution:
+        """
+        :return: the same Gaussian, whose samples do not depend on each other
+        """
+        other = DiagGaussianDistribution(self.action_dim)
+        other.distribution = self.distribution
+        return other
+
     def sample(self) -> th.Tensor:
         """
         :return: actions, ``(n_envs, action_dim)``

@@ -75,22 +75,27 @@ def check_observation_space(space: spaces.Space) -> spaces.Dict:
 
 def check_normalization(venv: VecEnv) -> None:
     """
-    Refuse images that ``VecNormalize`` normalises pixel by pixel: they would arrive on another scale than the encoder assumes.
+    Refuse what ``VecNormalize`` must leave as it is: the privileged observation, in whose units and bounds blurring, reward
+    transformation and the encoder's uncertainty are, and images, which would arrive on another scale than the encoder assumes.
 
-    The space of uint8 images changes when they are normalised, that of float16 images does not.
+    The space of uint8 images changes when they are normalised, that of float16 images and of ``privileged`` does not.
 
     :param venv: environments under the observation contract
     :raises ValueError: naming the remedy
     """
     normalize = unwrap_vec_normalize(venv)
     space = venv.observation_space
-    if normalize is None or not normalize.norm_obs or not isinstance(space, spaces.Dict) or TARGET not in space.spaces:
+    if normalize is None or not normalize.norm_obs or not isinstance(space, spaces.Dict):
         return
-    if TARGET in (normalize.norm_obs_keys or ()) and is_image(space[TARGET]):
-        raise ValueError(
-            f"VecNormalize normalises the images under '{TARGET}' (norm_obs_keys={normalize.norm_obs_keys}), which the "
-            "encoder does itself: use VecNormalize(..., norm_obs_keys=['common'])."
-        )
+    refused = {PRIVILEGED: "the privileged observation, in whose units and bounds the uncertainty is"}
+    if TARGET in space.spaces and is_image(space[TARGET]):
+        refused[TARGET] = "images, which the encoder normalises itself"
+    for key, reason in refused.items():
+        if key in (normalize.norm_obs_keys or ()):
+            raise ValueError(
+                f"VecNormalize normalises '{key}' (norm_obs_keys={normalize.norm_obs_keys}), {reason}: "
+                "use VecNormalize(..., norm_obs_keys=['common'])."
+            )
 
 
 def check_finite(observation: Mapping[str, np.ndarray]) -> None:

@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, maybe_transpose
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
@@ -342,6 +342,8 @@ class USPLPolicy(ActorCriticPolicy):
             obs = {PRIVILEGED: shown, TRUTH: shown, UNCERTAINTY: felt, BELIEF: mean}
             tensors = {key: th.as_tensor(value.copy(), device=self.device) for key, value in obs.items()}
             distribution = self.get_distribution({COMMON: tokens[COMMON], **tensors})
+            if isinstance(distribution, CorrelatedGaussianDistribution):
+                distribution = distribution.independent()  # the noise of the training's environments is not touched
             actions = distribution.get_actions(deterministic=deterministic).cpu().numpy()
         actions = actions.reshape((n_envs, *self.action_space.shape))  # type: ignore[misc, arg-type]
         if isinstance(self.action_space, spaces.Box):
@@ -364,7 +366,8 @@ class USPLPolicy(ActorCriticPolicy):
             raise ValueError(
                 f"The observation has the keys {sorted(observation)}; the deployment policy also needs {missing}."
             )
-        arrays = {key: np.asarray(observation[key]) for key in keys}
+        # Images with the channels last come as the environment has them, while the training saw SB3's transposed ones.
+        arrays = {key: maybe_transpose(np.asarray(observation[key]), self.contract[key]) for key in keys}
         check_finite(arrays)
         vectorized = is_vectorized_observation(arrays[COMMON], self.contract[COMMON])
         if not vectorized:

@@ -2,6 +2,9 @@
 
 import math
 
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
+
 
 def cosine_progress(step: float, start: float, period: float) -> float:
     """
@@ -43,3 +46,12 @@ class CosineSchedule:
 
     def __repr__(self) -> str:
         return f"CosineSchedule(initial={self.initial}, floor={self.floor})"
+
+
+def falling(rate: float | Schedule, floor: float) -> Schedule:
+    """
+    :param rate: learning rate, which falls along a cosine, or a schedule, which is used as it is
+    :param floor: share of the learning rate that is left at the end
+    :return: schedule
+    """
+    return FloatSchedule(CosineSchedule(float(rate), floor) if isinstance(rate, int | float) else rate)

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl import _arguments
@@ -24,7 +24,7 @@ from sb3_uspl.encoder import ObservationEncoder
 from sb3_uspl.encoder.training import fit
 from sb3_uspl.observations import COMMON
 from sb3_uspl.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, USPLPolicy
-from sb3_uspl.schedules import CosineSchedule, cosine_progress
+from sb3_uspl.schedules import CosineSchedule, cosine_progress, falling
 from sb3_uspl.symmetries import Symmetry
 from sb3_uspl.uncertainty import C_MAX, C_MIN, DELTA, smoothing_factor
 from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
@@ -102,7 +102,7 @@ class USPLPPO(PPO):
     :param wander_actions: components of a continuous action that are drawn at random there, and around what (``{1: 0.6}``),
         where the policy has no reason yet to turn a camera to what is to be seen. None: all, around the middle.
     :param replay: "mismatched" replays mismatched episodes only (release), "all" every episode (Alg. 1)
-    :param replay_bytes: memory budget of the episode replay
+    :param replay_bytes: memory budget of the episode replay; 0: the encoder learns from the rollout's own episodes only
     :param encoder_learning_rate: of the encoder (Tables 4 and 5: 5e-5 and 2e-5 for the large one), or a schedule
     :param encoder_learning_rate_floor: share of it left at the end of training, after half a cosine wave (release: 1)
     :param encoder_weight_decay: of the encoder (Tables 4 and 5)
@@ -212,8 +212,6 @@ class USPLPPO(PPO):
     ):
         if use_sde:
             raise ValueError("USPLPPO anneals the action noise itself (action_std); use_sde=True is not supported.")
-        if isinstance(learning_rate, int | float):
-            learning_rate = CosineSchedule(float(learning_rate), learning_rate_floor)
         super().__init__(
             # SB3 refuses "MlpPolicy" on a Dict space by its name, so the name is resolved first.
             self.policy_aliases.get(policy, policy) if isinstance(policy, str) else policy,  # type: ignore[arg-type]
@@ -267,23 +265,27 @@ class USPLPPO(PPO):
         self._rollout_env: UncertaintyVecWrapper | None = None
         self._progress_period: tuple[int, int] | None = None
         self._replay_is_lost = False
+        self._restarted: bool | None = None
         if _init_setup_model:
             self._setup_model()
 
     # -- set-up ------------------------------------------------------------------------------------------------------------
 
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = falling(self.learning_rate, self.learning_rate_floor)
+
     def _setup_model(self) -> None:
         self.discrete_privileged = _arguments.ask_discrete_privileged(self.env, self.discrete_privileged)
         self.symmetries = _arguments.ask_symmetries(self.env, self.symmetries)
         self._check_arguments()
-        self.n_mismatched = _arguments.count_mismatched(self.mismatch_fraction, self.n_envs)
+        # A model that was trained is loaded with any number of environments, be it to evaluate it in one.
+        loaded = self.num_timesteps > 0
+        self.n_mismatched = _arguments.count_mismatched(self, lenient=loaded)
         period = self.decision_period = _arguments.ask_decision_period(self.env, self.decision_period)
-        rate, floor = self.encoder_learning_rate, self.encoder_learning_rate_floor
-        self.encoder_lr_schedule = FloatSchedule(CosineSchedule(rate, floor) if isinstance(rate, int | float) else rate)
+        self.encoder_lr_schedule = falling(self.encoder_learning_rate, self.encoder_learning_rate_floor)
         smoothing = smoothing_factor(self.smoothing_time, self.decision_period)
         given = self.policy_kwargs, self.rollout_buffer_kwargs
-        self.policy_kwargs = {
-            **self.policy_kwargs,
+        derived = {
             "uncertainty_input": self.uncertainty_input,
             "mean_input": self.mean_input,
             "discrete_privileged": self.discrete_privileged,
@@ -293,6 +295,8 @@ class USPLPPO(PPO):
             "encoder_learning_rate": self.encoder_lr_schedule(1.0),
             "encoder_weight_decay": self.encoder_weight_decay,
         }
+        _arguments.check_policy_kwargs(self.policy_kwargs, derived)
+        self.policy_kwargs = {**self.policy_kwargs, **derived}
         self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, "n_mismatched": self.n_mismatched}
         super()._setup_model()
         # What was derived stays out of the arguments that save() stores and load() compares.
@@ -327,7 +331,7 @@ class USPLPPO(PPO):
             delta=self.delta,
             discrete_privileged=self.discrete_privileged,
             n_mismatched=self.n_mismatched,
-            mismatch_hold=hold and _arguments.in_decisions("mismatch_hold_time", hold, period),
+            mismatch_hold=None if hold is None else _arguments.in_decisions("mismatch_hold_time", hold, period),
             wander_share=self.wander_share,
             wander_hold=_arguments.in_decisions("wander_time", self.wander_time, period),
             wander_actions=self.wander_actions,
@@ -359,18 +363,24 @@ class USPLPPO(PPO):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         fresh = reset_num_timesteps or self._last_obs is None
+        if self.num_timesteps > 0:
+            _arguments.count_mismatched(self)  # more strictly than when it was loaded
         if not len(self._episodes.replay):
             self._replay_is_lost = not reset_num_timesteps and self.num_timesteps > 0
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if self._progress_period is None or reset_num_timesteps:
-            warmup = int(0.2 * total_timesteps) if self.warmup_timesteps is None else self.warmup_timesteps
-            ramp = int(0.5 * total_timesteps) if self.ramp_timesteps is None else self.ramp_timesteps
-            self._progress_period = (warmup, ramp)
+        warmup, ramp = int(0.2 * total_timesteps), int(0.5 * total_timesteps)
+        if self._progress_period is not None and not reset_num_timesteps:
+            warmup, ramp = self._progress_period
+        self._progress_period = (
+            warmup if self.warmup_timesteps is None else self.warmup_timesteps,
+            ramp if self.ramp_timesteps is None else self.ramp_timesteps,
+        )
+        if self._restarted is None or reset_num_timesteps:
+            self._restarted = self.progress > 0.0
         assert self.env is not None and isinstance(self._last_obs, dict)
         wrapper = self._rollout_env
         if wrapper is None or wrapper.venv is not self.env or wrapper.encoder is not self.policy.encoder:
             wrapper = self._make_rollout_env(self.env)
-            wrapper.progress = self.progress  # a training that goes on is not at the end of its warm-up, see `policy_restart`
             self._rollout_env, fresh = wrapper, True
         if fresh:
             self._episodes.forget_running()
@@ -399,8 +409,9 @@ class USPLPPO(PPO):
         # `model.env` stays what the user gave (callbacks, VecNormalize, set_env rely on it); only experience is transformed.
         wrapper = self._rollout_env
         assert wrapper is not None and env is self.env
-        if self.policy_restart and wrapper.progress == 0.0 < self.progress:
+        if self.policy_restart and not self._restarted and self.progress > 0.0:
             self.policy.restart(self.lr_schedule)
+            self._restarted = True
         wrapper.progress = self.progress
         if self.mismatch_hold_time is None:
             wrapper.redraw_mismatch()
@@ -415,7 +426,12 @@ class USPLPPO(PPO):
             self.policy.action_dist.correlation = correlation
         # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.
         with torch_threads(1):
-            return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
+            try:
+                return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
+            except BaseException:
+                # Ctrl-C, or an environment's error: the environments may be a decision ahead of what is stored.
+                self._last_obs = None
+                raise
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         """Episode statistics of the privileged policy, without the mismatched environments."""
@@ -447,7 +463,7 @@ class USPLPPO(PPO):
             wrapper.rebuild_memory(*episodes.running_tokens(self.device))
         episodes.end_iteration()
         self.logger.record("encoder/replay_episodes", len(episodes.replay))
-        self.logger.record("encoder/replay_fill", episodes.nbytes / episodes.max_bytes)
+        self.logger.record("encoder/replay_fill", episodes.nbytes / max(1, episodes.max_bytes))
 
     def _train_encoder(self, encoder: ObservationEncoder) -> None:
         """Maximum likelihood on whole episodes, Eq. 1. Touches nothing that PPO's update does, which may run beside it."""

@@ -176,7 +176,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     :param encoder: observation encoder
     :param config: blurring, reward transformation, smoothing
     :param seed: of the blur noise and the mismatching
-    :raises ValueError: if images are normalised
+    :raises ValueError: if images or the privileged observation are normalised
     """
 
     def __init__(self, venv: VecEnv, encoder: ObservationEncoder, config: UncertaintyConfig, seed: int | None = None):

@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl.baselines.resel_policy import RESeLPolicy
 from sb3_uspl.baselines.sequences import HistoryVecWrapper, SequenceRolloutBuffer
-from sb3_uspl.observations import check_observation_space
-from sb3_uspl.schedules import CosineSchedule
+from sb3_uspl.observations import check_normalization, check_observation_space
+from sb3_uspl.schedules import CosineSchedule, falling
 
 SelfRESeLPPO = TypeVar("SelfRESeLPPO", bound="RESeLPPO")
 
@@ -74,8 +74,6 @@ class RESeLPPO(PPO):
     ):
         if kwargs.get("use_sde"):
             raise ValueError("RESeLPPO anneals the action noise itself (action_std); use_sde=True is not supported.")
-        if isinstance(learning_rate, int | float):
-            learning_rate = CosineSchedule(float(learning_rate), learning_rate_floor)
         kwargs["rollout_buffer_class"] = kwargs.get("rollout_buffer_class") or SequenceRolloutBuffer
         super().__init__(
             # SB3 refuses "MlpPolicy" on a Dict space by its name, so the name is resolved first.
@@ -100,6 +98,9 @@ class RESeLPPO(PPO):
         if _init_setup_model:
             self._setup_model()
 
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = falling(self.learning_rate, self.learning_rate_floor)
+
     def _setup_model(self) -> None:
         self._check_arguments()
         self.encoder_lr_schedule = FloatSchedule(self.encoder_learning_rate)
@@ -115,6 +116,8 @@ class RESeLPPO(PPO):
 
     def _check_arguments(self) -> None:
         check_observation_space(self.observation_space)
+        if self.env is not None:
+            check_normalization(self.env)
         if not issubclass(self.policy_class, RESeLPolicy):
             raise ValueError(f"RESeLPPO needs a subclass of RESeLPolicy as policy; {self.policy_class} was given.")
         if not issubclass(self.rollout_buffer_class or SequenceRolloutBuffer, SequenceRolloutBuffer):
@@ -172,10 +175,14 @@ class RESeLPPO(PPO):
             self.policy.set_action_std(self._action_std_schedule(self._current_progress_remaining))
         buffer.keep_running(self._last_episode_starts)
         self._last_obs = wrapper.resume(*buffer.running_tokens())  # type: ignore[assignment]
-        going_on = super().collect_rollouts(wrapper, callback, buffer, n_rollout_steps)
-        if not going_on:
-            # SB3 leaves out the decision at which a callback stops: the history has a gap, so the episodes start anew.
-            self._last_obs = None
+        going_on = False
+        try:
+            going_on = super().collect_rollouts(wrapper, callback, buffer, n_rollout_steps)
+        finally:
+            if not going_on:
+                # SB3 leaves out the decision at which a callback stops, as does an interrupt: the history has a gap, so the
+                # episodes start anew.
+                self._last_obs = None
         return going_on
 
     def train(self) -> None:

@@ -183,6 +183,20 @@ def test_all_supported_spaces_step_as_in_dummy_vec_env(observation_space, action
     assert_equivalent(env_fns, n_steps=30, n_workers=2)
 
 
+def test_binary_actions_may_be_floating_point_numbers_as_sb3s_policies_give_them():
+    class Recorder(ToyEnv):
+        def step(self, action):
+            return *super().step(action)[:4], {"action": action.copy()}
+
+    env = BulletVecEnv([functools.partial(Recorder, action_space=ACTION_SPACES[3])] * 2, n_workers=2)
+    try:
+        env.reset()
+        given = np.array([[0, 1, 1, 0], [1, 0, 0, 1]], dtype=np.float32)
+        assert all((info["action"] == row).all() for info, row in zip(env.step(given)[3], given, strict=True))
+    finally:
+        env.close()
+
+
 def test_spawned_workers_do_the_same():
     assert_equivalent([functools.partial(gymnasium.make, f"bullet_tasks:{ENV_IDS[0]}")] * 2, 20, start_method="spawn")
 

@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_uspl import RESeLPolicy, USPLPolicy
 from sb3_uspl._configs import CONFIGS, load_entries
-from sb3_uspl._zoo import ALGORITHMS, is_ours
+from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, is_ours, use_default_config, use_default_folder
 from tests.sb3_uspl.commands import ENV, run, run_apart, train
 
 
@@ -175,6 +175,19 @@ def test_importing_the_package_does_not_import_the_zoo_or_pybullet():
     heavy = "{'rl_zoo3', 'pybullet', 'matplotlib'}"
     code = f"import sys, sb3_uspl; sys.exit(bool({heavy} & {{name.split('.')[0] for name in sys.modules}}))"
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+@pytest.mark.parametrize("given", [["-conf", "mine.yml", "-f", "logs"], ["--conf-file=mine.yml", "--folder=logs"]])
+def test_what_the_command_line_says_is_not_replaced_by_defaults(monkeypatch, given):
+    for algo in (["--algo", "rma"], ["--algo=rma"]):
+        monkeypatch.setattr(sys, "argv", ["train", *algo])
+        use_default_config()
+        use_default_folder()
+        assert sys.argv[-4:] == ["-conf", str(CONFIGS / "rma.yml"), "-f", str(TRAINED_AGENTS)]
+        monkeypatch.setattr(sys, "argv", before := ["train", *algo, *given])
+        use_default_config()
+        use_default_folder()
+        assert sys.argv == before
 
 
 @pytest.mark.parametrize("algo", sorted(ALGORITHMS))

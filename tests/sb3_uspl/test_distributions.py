@@ -1,5 +1,6 @@
 """Correlated exploration: each sample as Gaussian as ever, samples in a row alike."""
 
+import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -7,6 +8,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_uspl import USPLPPO
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from tests.sb3_uspl.toy import ToyEnv
+
+
+def test_the_deployment_policy_draws_independent_actions_and_leaves_the_trainings_noise_alone():
+    model = USPLPPO("MlpPolicy", DummyVecEnv([ToyEnv] * 8), n_steps=8, batch_size=64, action_noise_time=10.0, seed=0).learn(64)
+    noise = model.policy.action_dist.noise.clone()
+    obs = {"common": np.zeros((400, 2), np.float32)}
+    first, second = (model.predict(obs, deterministic=False)[0][:, 0] for _ in range(2))
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
+    assert th.equal(model.policy.action_dist.noise, noise)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.95])

@@ -1,11 +1,13 @@
 """Training on: from a model that was saved, and from a shipped agent without legs to one with them."""
 
 import csv
+import warnings
 
 import pytest
 import yaml
+from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_uspl import USPLPPO
+from sb3_uspl import USPLPPO, RESeLPPO
 from sb3_uspl._zoo import TRAINED_AGENTS
 from sb3_uspl.buffers import EpisodeReplayBuffer
 from tests.sb3_uspl.commands import run
@@ -64,10 +66,63 @@ def test_a_loaded_encoder_is_not_fitted_to_the_first_few_episodes_of_a_new_repla
     assert asked[0][0] == 3, "a training that begins anew is like any other"
 
 
-def test_a_policy_that_started_anew_after_the_warm_up_does_not_do_so_again(tmp_path):
+@pytest.mark.parametrize(("rollouts", "anew"), [(1, True), (2, False), (3, False)])
+def test_a_policy_starts_anew_after_the_warm_up_once_whenever_it_was_saved(tmp_path, rollouts, anew):
     model = make_model(policy_restart=True, warmup_timesteps=8 * 16, ramp_timesteps=0)
-    model.learn(8 * 16 * 3)
+    model.learn(8 * 16 * rollouts)
     model.save(tmp_path / "model")
     loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8), learning_rate=0.0)
     loaded.learn(8 * 16 * 2, reset_num_timesteps=False)
-    assert (loaded.policy.action_net.weight == model.policy.action_net.weight).all()
+    assert (loaded.policy.action_net.weight != model.policy.action_net.weight).any() == anew
+
+
+@pytest.mark.parametrize("algorithm", [USPLPPO, RESeLPPO])
+def test_a_learning_rate_given_to_load_falls_as_one_given_before_does(tmp_path, algorithm):
+    algorithm("MlpPolicy", make_venv(8), n_steps=16, batch_size=32, learning_rate_floor=0.1).save(tmp_path / "model")
+    given = {"learning_rate": 1e-3, "learning_rate_floor": 0.5}
+    for kwargs, ends in ({}, (3e-4, 3e-5)), ({"learning_rate": 1e-3}, (1e-3, 1e-4)), (given, (1e-3, 5e-4)):
+        loaded = algorithm.load(tmp_path / "model", env=make_venv(8), **kwargs)
+        assert (loaded.lr_schedule(1.0), loaded.lr_schedule(0.0)) == pytest.approx(ends)
+    constant = algorithm.load(tmp_path / "model", env=make_venv(8), learning_rate=lambda _: 1e-3)
+    assert constant.lr_schedule(0.0) == 1e-3
+
+
+def test_a_ramp_given_to_load_replaces_the_first_one(tmp_path):
+    make_model(warmup_timesteps=64).learn(256).save(tmp_path / "model")
+    for kwargs, period in ({}, (64, 128)), ({"warmup_timesteps": 100, "ramp_timesteps": 1000}, (100, 1000)):
+        loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8), **kwargs)
+        loaded.learn(512, reset_num_timesteps=False)
+        assert loaded._progress_period == period
+
+
+def test_a_trained_model_is_loaded_with_one_environment_but_not_trained_with_it(tmp_path):
+    make_model(mismatch_fraction=0.5).learn(128).save(tmp_path / "model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded = USPLPPO.load(tmp_path / "model", env=make_venv(1))
+        evaluate_policy(loaded, loaded.get_env(), n_eval_episodes=1)
+    with pytest.raises(ValueError, match="no pair"):
+        loaded.learn(128, reset_num_timesteps=False)
+
+
+def test_an_interrupt_in_the_middle_of_a_step_leaves_no_episode_of_two(monkeypatch):
+    """The environments have stepped, the history has not: going on must not join what came before to what comes after."""
+    model = make_model()
+    wait, calls = model.env.step_wait, []
+
+    def interrupted():
+        result = wait()
+        calls.append(None)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(model.env, "step_wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(512)
+    model.learn(512, reset_num_timesteps=False)
+    episodes = model.rollout_buffer.episodes
+    assert len(episodes.replay)
+    for episode in episodes.replay:
+        truth = episode.arrays["truth"]
+        assert len(truth) == 8 and (truth == truth[0]).all()

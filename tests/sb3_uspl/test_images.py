@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_uspl import RMA, USPLPPO
+from sb3_uspl import RMA, USPLPPO, RESeLPPO
 from sb3_uspl.encoder import MEMORIES, ImageCNN, ObservationEncoder, gaussian_nll
 from sb3_uspl.encoder import encoder as encoder_module
 from sb3_uspl.observations import POLICY_KEYS, TARGET, check_observation_space, is_image
@@ -261,14 +261,31 @@ def test_what_is_an_image():
 
 
 @pytest.mark.parametrize("image", [BYTES, HALVES], ids=["uint8", "float16"])
-def test_normalised_images_are_refused(image):
+def test_normalised_images_and_privileged_observations_are_refused(image):
     def venv(keys):
         return VecNormalize(make_vec_env(ToyEnv, n_envs=4, env_kwargs={"target": image}), norm_obs_keys=keys)
 
-    def learn(keys):
-        few = {"n_steps": 8, "batch_size": 32, "encoder_updates": 1, "encoder_batch_size": 32}
-        USPLPPO("MultiInputPolicy", venv(keys), mismatch_fraction=0.5, device="cpu", **few).learn(32)
+    few = {"n_steps": 8, "batch_size": 32, "device": "cpu"}
+    for algorithm in (USPLPPO, RESeLPPO):
+        for key, reason in (("target", ""), ("privileged", "units and bounds")):
+            with pytest.raises(ValueError, match=rf"VecNormalize.*{reason}.*norm_obs_keys=\['common'\]"):
+                algorithm("MultiInputPolicy", venv(["common", key]), **few)
+    model = USPLPPO(
+        "MultiInputPolicy", venv(["common"]), mismatch_fraction=0.5, encoder_updates=1, encoder_batch_size=32, **few
+    ).learn(32)
+    model.set_env(venv(["common", "privileged"]))
+    with pytest.raises(ValueError, match="units and bounds"):
+        model.learn(32)
 
-    with pytest.raises(ValueError, match=r"VecNormalize.*norm_obs_keys=\['common'\]"):
-        learn(["common", "target"])
-    learn(["common"])
+
+def test_images_with_the_channels_last_are_predicted_on_as_they_were_trained_on():
+    image = spaces.Box(0, 255, (36, 48, 3), np.uint8)
+    few = {"n_steps": 8, "batch_size": 32, "encoder_updates": 1, "encoder_batch_size": 32, "seed": 0}
+    venv = make_vec_env(ToyEnv, n_envs=4, env_kwargs={"target": image})
+    model = USPLPPO("CnnPolicy", venv, mismatch_fraction=0.5, device="cpu", **few).learn(64)
+    pixels = np.random.default_rng(0).integers(0, 256, (2, *image.shape)).astype(np.uint8)
+    obs = {"common": np.zeros((2, 2), np.float32), "target": pixels}
+    transposed = {**obs, "target": pixels.transpose(0, 3, 1, 2)}
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], model.predict(transposed, deterministic=True)[0])
+    alone = {key: value[0] for key, value in obs.items()}
+    assert model.predict(alone, deterministic=True)[0].shape == (1,)

@@ -349,11 +349,17 @@ def test_success_of_the_privileged_policy_leaves_out_mismatched_environments():
         (dict(n_envs=2, mismatch_fraction=0.25), "n_envs >= 6"),
         (dict(discrete_privileged={1: [0.0, 0.25]}), "names dimension 1"),
         (dict(discrete_privileged={0: [0.0, 3.0]}), "within the bounds"),
-        (dict(discrete_privileged={0: [0.1]}), "two different values"),
+        (dict(discrete_privileged={0: [0.1]}), "two values or more, each once"),
+        (dict(discrete_privileged={0: [0.0, 0.0, 0.25]}), "two values or more, each once"),
         (dict(blur_noise="pink"), "choose 'uniform' or 'gaussian'"),
         (dict(replay="none"), "'mismatched' or 'all'"),
         (dict(decision_period=0.0), "decision_period=0.0 is outside"),
         (dict(mismatch_fraction=1.5), "mismatch_fraction=1.5 is outside"),
+        (dict(n_envs=4, mismatch_fraction=0.9), "leaves none whose episodes PPO learns from"),
+        (dict(mismatch_hold_time=()), "two positive numbers"),
+        (dict(replay_bytes=-1), "replay_bytes=-1 is outside"),
+        (dict(encoder_max_grad_norm=0.0), "encoder_max_grad_norm=0.0 is outside"),
+        (dict(policy_kwargs=dict(mean_input=False)), "mean_input.*to USPLPPO itself"),
         (dict(smoothing_time=-1.0), "smoothing_time=-1.0 is outside"),
         (dict(action_std=0.0), "one positive number"),
         (dict(action_std=[0.1, 0.2]), "one for each of the 1 action"),
@@ -384,9 +390,32 @@ def test_one_environment_works_with_a_warning():
     model.learn(64)
 
 
-def test_decision_period_comes_from_the_environment():
+def test_wandering_without_mismatched_environments_is_pointed_out():
+    with pytest.warns(UserWarning, match="only mismatched environments wander"):
+        make_model(mismatch_fraction=0.0, wander_share=0.5)
+
+
+def test_without_a_replay_the_encoder_learns_from_each_rollout():
+    model = make_model(replay_bytes=0).learn(512)
+    assert not len(model.rollout_buffer.episodes.replay) and model.policy.encoder_optimizer.state
+
+
+class SilentEnv(ToyEnv):
+    """Does not say how long a decision lasts."""
+
+    @property
+    def decision_period(self):
+        raise AttributeError
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_decision_period_comes_from_the_environment(vec_env_cls):
     assert make_model().decision_period == ToyEnv.decision_period
     assert make_model(decision_period=0.1).decision_period == 0.1
+    venv_kwargs = dict(start_method="fork") if vec_env_cls is SubprocVecEnv else {}
+    silent = make_vec_env(SilentEnv, 8, vec_env_cls=vec_env_cls, vec_env_kwargs=venv_kwargs)
+    assert USPLPPO("MlpPolicy", silent, **FAST).decision_period == 0.02
+    silent.close()
 
 
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.0, 10.0)])
