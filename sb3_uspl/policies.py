@@ -7,15 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, maybe_transpose
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.common.utils import is_vectorized_observation
 from torch import nn
 
-from sb3_uspl.activations import recoverable_tanh
+from sb3_uspl.contract_policy import ContractPolicy
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
 from sb3_uspl.encoder import MemoryState, ObservationEncoder, encode_actions, reset_rows
 from sb3_uspl.observations import (
@@ -27,7 +24,6 @@ from sb3_uspl.observations import (
     TARGET,
     TRUTH,
     UNCERTAINTY,
-    check_finite,
     check_observation_space,
     is_image,
     policy_observation_space,
@@ -50,7 +46,7 @@ class DeploymentState(NamedTuple):
     """The encoder's memory."""
 
 
-class USPLPolicy(ActorCriticPolicy):
+class USPLPolicy(ContractPolicy):
     """
     Privileged policy and observation encoder (Sec. 3.1).
 
@@ -144,9 +140,7 @@ class USPLPolicy(ActorCriticPolicy):
             one_hot=one_hot,
             symmetries=symmetries,
         )
-        for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
-            if kwargs.pop(name, None) not in (None, PolicyFeatures, {}, False):
-                raise ValueError(f"USPLPolicy builds its own features; '{name}' cannot be set.")
+        self._own_features(kwargs)
         if kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
             # SB3's epsilon. Small networks' minibatches spend a tenth of their time in Adam's loop over the parameters.
             kwargs["optimizer_kwargs"] = {"eps": 1e-5, "fused": True, **(kwargs.get("optimizer_kwargs") or {})}
@@ -161,13 +155,7 @@ class USPLPolicy(ActorCriticPolicy):
             share_features_extractor=False,
             **kwargs,
         )
-        self.bounded_mean = bounded_mean and isinstance(action_space, spaces.Box)
-        if self.bounded_mean:
-            low, high = (th.as_tensor(bound, device=self.device) for bound in (action_space.low, action_space.high))  # type: ignore[attr-defined]
-            self.action_centre: th.Tensor
-            self.action_half_range: th.Tensor
-            self.register_buffer("action_centre", 0.5 * (high + low).flatten())
-            self.register_buffer("action_half_range", 0.5 * (high - low).flatten())
+        self._bound_mean(bounded_mean)
         self.initial_action = initial_action
         if initial_action is not None:
             self._begin_with(initial_action)
@@ -200,13 +188,6 @@ class USPLPolicy(ActorCriticPolicy):
         data.pop("features_extractor_class")
         data.pop("features_extractor_kwargs")
         return {**data, "observation_space": self.contract, **self.encoder_arguments, **self.feature_arguments}
-
-    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
-        if not self.bounded_mean:
-            return super()._get_action_dist_from_latent(latent_pi)
-        assert isinstance(self.action_dist, DiagGaussianDistribution)
-        mean = self.action_centre + self.action_half_range * recoverable_tanh(self.action_net(latent_pi))
-        return self.action_dist.proba_distribution(mean, self.log_std)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         return super().forward(self._only_policy_keys(obs), deterministic)  # type: ignore[arg-type]
@@ -272,15 +253,6 @@ class USPLPolicy(ActorCriticPolicy):
             if self.initial_action is not None:
                 self._begin_with(self.initial_action)
         self.to(self.device)
-
-    def set_action_std(self, std: float | Sequence[float] | np.ndarray) -> None:
-        """
-        Fix the standard deviation of continuous actions (App. C.3.1 anneals it instead of learning it).
-
-        :param std: standard deviation of the sampled actions, of all or of each, ``(n_action,)``
-        """
-        self.log_std.requires_grad_(False)
-        self.log_std.data.copy_(th.as_tensor(np.log(std)))
 
     def predict(  # type: ignore[override]
         self,
@@ -352,27 +324,6 @@ class USPLPolicy(ActorCriticPolicy):
             mean, std, encode_actions(actions, self.action_space), tuple(part.cpu().numpy() for part in memory)
         )
         return (actions if vectorized else actions[0]), next_state
-
-    def _as_tokens(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[dict[str, th.Tensor], bool]:
-        if not isinstance(observation, dict):
-            raise ValueError(
-                f"The observation is a {type(observation).__name__}; expected a dict with the keys "
-                f"{[key for key in self.contract.spaces if key != PRIVILEGED]}. `env.reset()` of a Gymnasium env returns "
-                "(obs, info): pass only obs."
-            )
-        keys = [key for key in (COMMON, TARGET) if key in self.contract.spaces]
-        missing = [key for key in keys if key not in observation]
-        if missing:
-            raise ValueError(
-                f"The observation has the keys {sorted(observation)}; the deployment policy also needs {missing}."
-            )
-        # Images with the channels last come as the environment has them, while the training saw SB3's transposed ones.
-        arrays = {key: maybe_transpose(np.asarray(observation[key]), self.contract[key]) for key in keys}
-        check_finite(arrays)
-        vectorized = is_vectorized_observation(arrays[COMMON], self.contract[COMMON])
-        if not vectorized:
-            arrays = {key: array[None] for key, array in arrays.items()}
-        return {key: th.as_tensor(array, device=self.device) for key, array in arrays.items()}, vectorized
 
     def _unpack_state(
         self, state: tuple[np.ndarray, ...] | None, n_envs: int

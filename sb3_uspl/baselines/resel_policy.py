@@ -1,23 +1,19 @@
 """The policy of RESeL-PPO: it acts on its history and is trained through its memory."""
 
-from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_uspl.activations import recoverable_tanh
 from sb3_uspl.baselines.sequences import EMBEDDING, HistoryEncoder, SequenceBatch
+from sb3_uspl.contract_policy import ContractPolicy
 from sb3_uspl.encoder import Tokens, encode_actions, reset_rows
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_observation_space
-from sb3_uspl.policies import USPLPolicy
 from sb3_uspl.policy_features import PolicyFeatures
 
 
@@ -30,7 +26,7 @@ class HistoryState(NamedTuple):
     """The encoder's memory."""
 
 
-class RESeLPolicy(ActorCriticPolicy):
+class RESeLPolicy(ContractPolicy):
     """
     Actor on the history of ``common``, ``target`` and actions; critic on the common and the true privileged observation.
 
@@ -77,9 +73,7 @@ class RESeLPolicy(ActorCriticPolicy):
             normalize_common=normalize_common,
             bounded_mean=bounded_mean,
         )
-        for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
-            if kwargs.pop(name, None) not in (None, PolicyFeatures, {}, False):
-                raise ValueError(f"RESeLPolicy builds its own features; '{name}' cannot be set.")
+        self._own_features(kwargs)
         history = HistoryEncoder(self.contract, get_flattened_obs_dim(action_space), encoder, memory, encoder_kwargs)
         embedding = spaces.Box(-np.inf, np.inf, (history.width,), np.float32)
         super().__init__(
@@ -94,17 +88,7 @@ class RESeLPolicy(ActorCriticPolicy):
         )
         self.encoder = history
         self.optimizer.add_param_group({"params": list(history.parameters())})
-        self.bounded_mean = bounded_mean and isinstance(action_space, spaces.Box)
-        if self.bounded_mean:
-            low, high = (th.as_tensor(bound) for bound in (action_space.low, action_space.high))  # type: ignore[attr-defined]
-            self.action_centre: th.Tensor
-            self.action_half_range: th.Tensor
-            self.register_buffer("action_centre", 0.5 * (high + low).flatten())
-            self.register_buffer("action_half_range", 0.5 * (high - low).flatten())
-
-    # A RESeLPolicy has no belief and so is no USPLPolicy, but these two mean the same for both.
-    _as_tokens: ClassVar[Callable[..., tuple[Tokens, bool]]] = USPLPolicy._as_tokens
-    set_action_std: ClassVar[Callable[..., None]] = USPLPolicy.set_action_std
+        self._bound_mean(bounded_mean)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """ActorCriticPolicy asks for the actor's features first, then for the critic's."""
@@ -127,13 +111,6 @@ class RESeLPolicy(ActorCriticPolicy):
         data.pop("features_extractor_class")
         data.pop("features_extractor_kwargs")
         return {**data, "observation_space": self.contract, **self.arguments}
-
-    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
-        if not self.bounded_mean:
-            return super()._get_action_dist_from_latent(latent_pi)
-        assert isinstance(self.action_dist, DiagGaussianDistribution)
-        mean = self.action_centre + self.action_half_range * recoverable_tanh(self.action_net(latent_pi))
-        return self.action_dist.proba_distribution(mean, self.log_std)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         assert isinstance(obs, dict)
