@@ -23,7 +23,7 @@ test: $(INSTALLED) lint type
 test-slow: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
 
-# Up to 20 minutes on two cores that nobody else uses; prints tables and writes benchmarks/results.json.
+# 15 to 35 minutes on two cores that nobody else uses; prints tables and writes benchmarks/results.json.
 benchmark: $(INSTALLED)
 	$(BIN)/python -m benchmarks
 

@@ -8,6 +8,7 @@ import itertools
 import os
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -127,8 +128,14 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         self.callbacks.append(ProgressCSV(os.path.join(self.save_path, "progress.csv")))
 
 
-def register() -> None:
-    """Make our algorithms (``--algo uspl_ppo``, ``rma``, ...) and environments known to the zoo's commands."""
+def register(packages: Iterable[str] = ()) -> None:
+    """
+    Make our algorithms (``--algo uspl_ppo``, ``rma``, ...) and environments known to the zoo's commands.
+
+    :param packages: modules that register further environments when they are imported (``--gym-packages``)
+    """
+    for package in packages:
+        importlib.import_module(package)
     rl_zoo3.ALGOS.update(ALGORITHMS)
     register_samplers()
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]

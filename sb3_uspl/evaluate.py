@@ -89,6 +89,7 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
     parser.add_argument("--n-envs", type=int, default=32, help="environments that run at the same time")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, for environments of your own")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     parser.add_argument(
         _episode.REPLAY, type=Path, help=".html file to write: the first of the episodes in 3-D, with a timeline"
@@ -101,7 +102,7 @@ def main() -> None:
     arguments = parse_arguments()
     if arguments.episodes < 1:
         raise SystemExit(f"--episodes {arguments.episodes}: at least one episode is needed.")
-    register()
+    register(arguments.gym_packages)
     th.set_num_threads(1)
     with contextlib.redirect_stdout(sys.stderr):  # the zoo prints too
         result = _measure(arguments)

@@ -162,6 +162,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--exp-id", type=int, default=0, help="experiment number; default: the latest")
     parser.add_argument("--load-best", action="store_true", help="best model of the training's evaluations")
     parser.add_argument("--horizon", type=int, help="decisions that a Transformer remembers; default: the longest episode")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, for environments of your own")
     parser.add_argument("-o", "--out", required=True, type=Path, help="file to write; its card lies beside it")
     return parser.parse_args()
 
@@ -181,7 +182,7 @@ def _export(arguments: argparse.Namespace) -> dict[str, Any]:
     from sb3_uspl._zoo import register
     from sb3_uspl.evaluate import load_agent
 
-    register()
+    register(arguments.gym_packages)
     model, venv = load_agent(
         arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, 1, path=arguments.path
     )

@@ -3,6 +3,7 @@
 import shutil
 import sys
 
+import gymnasium as gym
 import pytest
 
 from sb3_uspl import USPLPPO
@@ -43,6 +44,17 @@ def test_an_unknown_algorithm_is_told_what_there_is(command, tmp_path):
 def test_a_missing_agent_is_told_where_agents_lie(command, tmp_path):
     where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(tmp_path), *out(command, tmp_path))
     assert "<folder>/<algo>/<env>_<id>/" in refused(f"sb3_uspl.{command}", *where)
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_an_environment_of_ones_own_is_known_by_the_module_that_registers_it(command, tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text("import gymnasium\n\ngymnasium.register('Own-v0', 'tests.sb3_uspl.toy:ToyEnv')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    where = ("--algo", "uspl_ppo", "--env", "Own-v0", "-f", str(tmp_path), *out(command, tmp_path))
+    message = refused(f"sb3_uspl.{command}", *where, "--gym-packages", "own")
+    assert "<folder>/<algo>/<env>_<id>/" in message, "what is missing is the agent"
+    gym.registry.pop("Own-v0")
+    sys.modules.pop("own")
 
 
 @pytest.mark.parametrize("command", READERS)

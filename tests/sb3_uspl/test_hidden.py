@@ -87,8 +87,12 @@ def test_the_guides_programs_run(monkeypatch):
     namespace = {}
     exec(program, namespace)
     assert namespace["model"].num_timesteps == 2048
+    assert namespace["make"](render_mode="rgb_array").discrete_privileged == {0: [-0.25, 0.25]}
     exec(programs[1], namespace)
-    assert namespace["make"]().discrete_privileged == {0: [-0.25, 0.25]}
+    env = namespace["make"]()
+    env.reset(seed=0)
+    rewards = [env.step(env.action_space.sample())[1] for _ in range(200)]
+    assert env.discrete_privileged == {} and min(rewards) > 0.0
 
 
 def test_bad_parameters_are_refused():
