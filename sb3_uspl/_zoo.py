@@ -186,7 +186,7 @@ def check_command_line() -> None:
     for package in packages:
         importlib.import_module(package)
     env_id = _value_of("--env")
-    if env_id is not None:
+    if env_id:
         try:
             check_names("ppo", env_id)
         except ValueError as error:

@@ -384,6 +384,7 @@ class USPLPPO(PPO):
             self._rollout_env, fresh = wrapper, True
         if fresh:
             self._episodes.forget_running()
+            wrapper.progress = self.progress  # the first observation is blurred like those after it
             self._last_obs = wrapper.begin(self._last_obs)
         return result
 

@@ -95,6 +95,14 @@ def test_a_ramp_given_to_load_replaces_the_first_one(tmp_path):
         assert loaded._progress_period == period
 
 
+def test_the_first_observation_of_a_training_that_goes_on_is_blurred(tmp_path):
+    make_model(warmup_timesteps=0, ramp_timesteps=0).learn(128).save(tmp_path / "model")
+    loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8))
+    loaded._setup_learn(128, reset_num_timesteps=False)
+    shown, truth = (loaded._last_obs[key][: 8 - loaded.n_mismatched] for key in ("privileged", "truth"))
+    assert (shown != truth).any()  # not everywhere: the truth is at a bound, beyond which nothing is blurred
+
+
 def test_a_trained_model_is_loaded_with_one_environment_but_not_trained_with_it(tmp_path):
     make_model(mismatch_fraction=0.5).learn(128).save(tmp_path / "model")
     with warnings.catch_warnings():
