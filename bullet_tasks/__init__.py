@@ -3,6 +3,7 @@
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotor
 from bullet_tasks.tasks.blind_mass_stack import BlindMassStack
@@ -33,8 +34,8 @@ for _env_id, _task_class in _TASKS.items():
     gymnasium.register(
         id=_env_id,
         entry_point=f"{_task_class.__module__}:make_env",
-        max_episode_steps=_task_class().max_decisions,
-        # Both checks cost time at every step; the test suite runs them once for every registered task.
+        additional_wrappers=(WrapperSpec("TaskTimeLimit", "bullet_tasks.env:TaskTimeLimit", {}),),
+        # The checks cost time at every step; the test suite runs them once for every registered task.
         disable_env_checker=True,
         order_enforce=False,
     )

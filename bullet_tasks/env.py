@@ -8,16 +8,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.wrappers import TimeLimit
 
 from bullet_tasks.robots.base import Robot
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.sensors import Sensor
-from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Outcome, Task
 from bullet_tasks.world import World
 
-_VIEWS = ("top", "follow")
-_FOLLOWING_SIZE = (480, 360)  # pixels
 # Relative to one substep: how far the decision period may be from a whole number of substeps.
 _PERIOD_TOLERANCE = 1e-6
 
@@ -27,19 +26,20 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     Robot x task x sensors.
 
     Observations are a dict of ``common``, ``privileged`` and, if there is a sensor, ``target``. ``info`` holds
-    ``is_success`` (bool), ``position`` (float32 ``(2,)``, m), ``reward_terms`` (name -> float, their sum is the reward) and,
-    after a step, ``fallen`` (bool, see ``Robot``).
+    ``is_success`` (bool) and ``position`` (float32, m: ``(2,)``, or ``(3,)`` of what flies), and after a step ``reward_terms``
+    (name -> float, their sum is the reward) and ``fallen`` (bool, see ``Robot``).
 
     An episode depends on its seed and the actions alone, not on what happened before: it is started by repositioning
     bodies, which in PyBullet leaves no trace in later steps for a body without legs.
 
     PyBullet runs only where the robot's physics or a picture needs it.
 
+    It does not end when the task's time is up: ``TaskTimeLimit`` does, which ``gymnasium.make`` adds.
+
     :param make_robot: creates the robot in a world
     :param task: geometry, goal, rewards and ends
     :param sensors: at most one; its readings are the ``target`` observation
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
-    :param view: ``"top"`` shows the whole scene, ``"follow"`` walks behind the robot
     :raises ValueError: if an argument is not a possible choice
     """
 
@@ -51,26 +51,25 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         task: Task,
         sensors: Sequence[Sensor] = (),
         render_mode: str | None = None,
-        view: str = "top",
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"Unknown render_mode {render_mode!r}; known: None, {self.metadata['render_modes']}.")
-        if view not in _VIEWS:
-            raise ValueError(f"Unknown view {view!r}; known: {_VIEWS}.")
         if len(sensors) > 1:
             raise ValueError(f"At most one sensor can yield the `target` observation, got {len(sensors)}.")
         self.task = task
         self.sensors = tuple(sensors)
         self.render_mode = render_mode
-        self.view = view
         self.decision_period = task.decision_period
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / task.decision_period)}
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / task.decision_period))}
         observations: dict[str, spaces.Space[Any]] = {"common": task.common_space, "privileged": task.privileged_space}
         if self.sensors:
             observations["target"] = self.sensors[0].space
         self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
         self.action_space = task.action_space
         self._action_shape = task.action_space.shape
+        self._bounds: list[tuple[float, float]] = []
+        if isinstance(task.action_space, spaces.Box):
+            self._bounds = list(zip(task.action_space.low.tolist(), task.action_space.high.tolist(), strict=True))
         self._n_choices = task.action_space.nvec.tolist() if isinstance(task.action_space, spaces.MultiDiscrete) else None
         self.discrete_privileged, self.symmetries = task.discrete_privileged, task.symmetries
 
@@ -131,8 +130,11 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
         :param action: numbers in the action space; those beyond the bounds of a Box are clipped
         :raises ValueError: if the action has another shape, is not finite or names a choice that there is not
+        :raises ResetNeeded: before the first ``reset``
         """
         self._check_open()
+        if not self._privileged.size:
+            raise ResetNeeded("Call `reset` before the first `step`.")
         task, robot = self.task, self.robot
         robot.command(task.command(self._checked(action), robot.state))
         substeps, contacts, outcome = robot.advance(self._substeps, task.judge)
@@ -157,7 +159,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise RuntimeError("This environment is closed; make a new one.")
 
     def _checked(self, action: np.ndarray) -> list[float]:
-        """The action as floats: within [-1, 1], or each one of the choices."""
+        """The action as floats: within the bounds, or each one of the choices."""
         array = np.asarray(action, dtype=np.float64)
         if array.shape != self._action_shape:
             raise ValueError(f"An action must have shape {self._action_shape}, got {array.shape}.")
@@ -170,7 +172,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
                 if not (value.is_integer() and 0.0 <= value < n):
                     raise ValueError(f"An action must be whole numbers from 0 and below {self._n_choices}, got {values}.")
             return values
-        return [max(-1.0, min(1.0, value)) for value in values]
+        return [max(low, min(high, value)) for value, (low, high) in zip(values, self._bounds, strict=True)]
 
     def _observation(self) -> dict[str, np.ndarray]:
         state = self.robot.state
@@ -187,12 +189,25 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         if self.render_mode != "rgb_array":
             return None
         self._check_open()
-        simulation, state = self.world.simulation, self.robot.state
+        simulation = self.world.simulation
         self.robot.appear(simulation)
-        if self.view == "top":
-            return simulation.picture(self.task.camera, *self.task.picture_size)
-        return simulation.picture(Camera.following((state.x, state.y, state.z), state.yaw), *_FOLLOWING_SIZE)
+        return simulation.picture(self.task.camera, *self.task.picture_size)
 
     def close(self) -> None:
-        """Close the world; a second call does nothing."""
+        """Close the world and what sensors hold open; a second call does nothing."""
+        for sensor in self.sensors:
+            sensor.close()
         self.world.close()
+
+
+class TaskTimeLimit(TimeLimit):
+    """
+    Truncates an episode when the time is up that the task's configuration gives it, or after the ``max_episode_steps`` that
+    ``gymnasium.make`` was given.
+
+    :param env: a ``RobotTaskEnv``, within ``TimeLimit`` if ``max_episode_steps`` was given
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        given = None if env.spec is None else env.spec.max_episode_steps
+        super().__init__(env, given or env.get_wrapper_attr("task").max_decisions)

@@ -37,20 +37,6 @@ class Camera:
     up: Vector3 = (0.0, 0.0, 1.0)
     fov: float = 40.0
 
-    @classmethod
-    def following(cls, position: Vector3, yaw: float, distance: float = 2.2, height: float = 1.3) -> "Camera":
-        """
-        A camera behind and above a robot, looking the way it goes.
-
-        :param position: of the robot, m
-        :param yaw: of the robot, rad
-        :param distance: behind the robot, m
-        :param height: above the robot, m
-        """
-        x, y, z = position
-        c, s = math.cos(yaw), math.sin(yaw)
-        return cls((x - distance * c, y - distance * s, z + height), (x + 0.5 * c, y + 0.5 * s, z), fov=60.0)
-
 
 class _Client(BulletClient):
     """BulletClient without the line "argv[0]=" that its way of connecting prints for every client."""
@@ -108,7 +94,6 @@ class Simulation:
         self.client: Any = _Client(pybullet.GUI if gui else pybullet.DIRECT)
         self.closed = False
         self._ids: dict[str, int] = {}
-        self._names: dict[int, str] = {}
         if gui:
             self.client.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)
         # Bound once: looking a function up through BulletClient costs as much as a short call.
@@ -159,7 +144,6 @@ class Simulation:
             baseOrientation=quaternion(yaw),
         )
         self._ids[name] = body
-        self._names[body] = name
         return body
 
     def _collision_shape(self, shape: Shape) -> int:
@@ -205,20 +189,6 @@ class Simulation:
         self.client.resetBasePositionAndOrientation(body, position, quaternion(yaw, pitch))
         self.client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
-    def contact_forces(self, name: str) -> dict[str, float]:
-        """
-        Who touches a body, and how hard.
-
-        :param name: the body
-        :return: name of the other body -> sum of the normal forces of the last step, N
-        """
-        body = self.body_id(name)
-        forces: dict[str, float] = {}
-        for point in self._contact_points(body):
-            other = self._names[point[2] if point[1] == body else point[1]]
-            forces[other] = forces.get(other, 0.0) + point[_NORMAL_FORCE]
-        return forces
-
     def pressed(self, body: int, threshold: float) -> bool:
         """
         Whether anything pressed on a body during the last step.
@@ -232,7 +202,7 @@ class Simulation:
         """
         Remember the poses and velocities of all bodies.
 
-        :return: a handle for ``restore`` and ``forget``
+        :return: a handle for ``restore``
         """
         return self.client.saveState()
 
@@ -243,14 +213,6 @@ class Simulation:
         :param handle: from ``save``
         """
         self.client.restoreState(stateId=handle)
-
-    def forget(self, handle: int) -> None:
-        """
-        Free a saved state (about 0.2 MB each).
-
-        :param handle: from ``save``
-        """
-        self.client.removeState(handle)
 
     def picture(self, camera: Camera, width: int, height: int) -> np.ndarray:
         """

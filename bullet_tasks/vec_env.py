@@ -61,8 +61,10 @@ class BulletVecEnv(VecEnv):
         if not env_fns:
             raise ValueError("`env_fns` is empty: give at least one function that makes an environment.")
         n_workers = min(_cores(), len(env_fns)) if n_workers is None else n_workers
-        if not 1 <= n_workers <= len(env_fns):
-            raise ValueError(f"`n_workers` must be between 1 and the number of environments {len(env_fns)}, got {n_workers}.")
+        if n_workers != int(n_workers) or not 1 <= n_workers <= len(env_fns):
+            raise ValueError(
+                f"`n_workers` must be a whole number between 1 and the number of environments {len(env_fns)}, got {n_workers}."
+            )
         known = multiprocessing.get_all_start_methods()
         start_method = start_method or ("fork" if "fork" in known else "spawn")
         if start_method not in known:

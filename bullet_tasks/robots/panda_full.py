@@ -122,9 +122,9 @@ class FullPanda(PandaArm):
 
     def advance(self, n_substeps: int, judge: Judge) -> Stretch:
         """
-        Let the motion end, then judge (see base class).
+        Let the motion end, then judge (see base class). The rest of the time passes at rest.
 
-        :param n_substeps: that it may take at most
+        :param n_substeps: that it may take at most, and that count as passed
         :param judge: of the state after the motion
         """
         done = 0
@@ -132,7 +132,7 @@ class FullPanda(PandaArm):
             self._step()
             done += 1
         self.state = self._measure()
-        return Stretch(done, 0, judge(self.state))
+        return Stretch(n_substeps, 0, judge(self.state))
 
     def substep(self) -> ArmState:
         """Let 1/60 s pass (see base class)."""

@@ -64,7 +64,7 @@ NOT_HOVERING = -1.0
 """Since when a flight hovers that does not."""
 
 # Bodies nearer to the ground than this touch it; exact contact would depend on rounding.
-_TOUCH = 1e-4  # m
+TOUCH = 1e-4  # m
 # A body on the ground that is tilted less than this stands on all its feet.
 _STANDS = 0.01  # rad
 _TIME_ROUNDING = 1e-9  # s
@@ -137,7 +137,7 @@ def touches(flight: np.ndarray, body: np.ndarray) -> bool:
     :param flight: ``(N_FLIGHT,)``
     :param body: ``(N_BODY,)``
     """
-    return flight[Z] - reach_down(body, flight[ROLL], flight[PITCH]) <= _TOUCH
+    return flight[Z] - reach_down(body, flight[ROLL], flight[PITCH]) <= TOUCH
 
 
 @numba.njit(f"void({_ARRAY}, {_ARRAY}, boolean)", cache=True)

@@ -15,8 +15,6 @@ from bullet_tasks.robots.quadrotor_body import (
 from bullet_tasks.shapes import Box
 from bullet_tasks.world import World
 
-# PyBullet's distance is exact to rounding errors; that of the compiled quadrotor's ground is the same number.
-_TOUCH = 1e-4  # m
 _DISTANCE = 8  # index in a record of getClosestPoints (PyBullet Quickstart Guide)
 
 
@@ -37,6 +35,8 @@ class KinematicQuadrotor(Quadrotor):
         self._id = simulation.add_body(
             self.name, Box("body", (0.0, 0.0, 0.0), HALF_EXTENTS), looks(), (0.0, 0.0, 1.0), mass=MASS
         )
+        # The margin rounds a box's corners; without it distances are exact, and the same as the compiled quadrotor's.
+        simulation.client.changeDynamics(self._id, -1, collisionMargin=0.0)
         self._floors = [simulation.body_id(shape.name) for shape in world.scene.shapes if shape.floor]
         self._set_pose = simulation.client.resetBasePositionAndOrientation
         self._closest_points = simulation.client.getClosestPoints
@@ -48,8 +48,8 @@ class KinematicQuadrotor(Quadrotor):
 
     def _touches(self) -> bool:
         for floor in self._floors:
-            for point in self._closest_points(self._id, floor, _TOUCH):
-                if point[_DISTANCE] <= _TOUCH:
+            for point in self._closest_points(self._id, floor, kernels.TOUCH):
+                if point[_DISTANCE] <= kernels.TOUCH:
                     return True
         return False
 

@@ -31,3 +31,6 @@ class Sensor(ABC):
 
         :param state: of the robot that carries the sensor
         """
+
+    def close(self) -> None:  # noqa: B027 (most sensors hold nothing)
+        """Free what the sensor holds open, by default nothing; a second call does nothing."""

@@ -135,3 +135,6 @@ there; here the pixels are cast as they are."""
 SMALL = RELEASE.resized(48, 36)
 """The same view in a third of the pixels: at 1.5 m, 5.5 cm across and 3 cm up and down. Stable-Baselines3's own
 networks take no image with fewer than 36 rows or columns."""
+
+LENSES = {"small": SMALL, "release": RELEASE}
+"""By the names that a configuration file or a command line can give."""

@@ -80,26 +80,9 @@ class Scandots(Sensor):
         if self._scene is None:
             raise RuntimeError("The scandots have no scene yet; call `reset` before `read`.")
         self._pose[0] = state.x, state.y, state.z, state.yaw
-        return self._scanned(self._scene, self._pose)[0]
-
-    def scan(self, scenes: SceneArrays, poses: np.ndarray) -> np.ndarray:
-        """
-        One reading of each of several robots, each in a scene of its own.
-
-        :param scenes: as many as robots, from ``pack``
-        :param poses: x, y, z (m) and yaw (rad) of the robots' bases, ``(n, 4)``
-        :return: float32 ``(n, n_points)``, m
-        :raises ValueError: if there is not one pose for every scene
-        """
-        poses = np.ascontiguousarray(poses, dtype=np.float64)
-        if poses.shape != (len(scenes.ground), 4):
-            raise ValueError(f"`poses` must have shape {(len(scenes.ground), 4)}, x, y, z, yaw per scene; got {poses.shape}.")
-        return self._scanned(scenes, poses)
-
-    def _scanned(self, scenes: SceneArrays, poses: np.ndarray) -> np.ndarray:
-        readings = np.empty((len(poses), len(self.points)), dtype=np.float32)
-        look_down(*scenes, poses, self._rows, self._reach, self.standing_height, self.limit, readings)
-        return readings
+        readings = np.empty((1, len(self.points)), dtype=np.float32)
+        look_down(*self._scene, self._pose, self._rows, self._reach, self.standing_height, self.limit, readings)
+        return readings[0]
 
 
 def _ticks(name: str, bounds: tuple[float, float], spacing: float) -> np.ndarray:

@@ -36,7 +36,7 @@ _FLOOR: Colour = (0.86, 0.87, 0.84, 1.0)
 _LINE: Colour = (0.62, 0.64, 0.68, 1.0)
 _POST: Colour = (0.42, 0.50, 0.60, 1.0)
 _BAND: Colour = (0.20, 0.72, 0.38, 1.0)
-_FLOOR_HALF_SIZE = 70.0  # m; further than the greatest tilt drifts in an episode
+_FLOOR_PER_TIME = 70.0 / (12.0 * math.tan(0.5))  # m/s for a tilt of 45 degrees; further than it drifts
 _FLOOR_HALF_HEIGHT = 0.05  # m
 _LINE_DISTANCE, _N_LINES = 2.0, 6  # m; lines on either side of the middle one
 _POST_DISTANCE, _N_POSTS = 4.0, 3
@@ -62,6 +62,7 @@ class HoverReward:
     :param success: once, for a hover that has been held
     :param time_bonus: once, at success, times the fraction of the episode's time that is left
     :param crash: once, for a crash
+    :raises ValueError: if a decay is not positive
     """
 
     altitude: float = 0.5
@@ -73,6 +74,11 @@ class HoverReward:
     success: float = 8.0
     time_bonus: float = 12.0
     crash: float = -6.0
+
+    def __post_init__(self) -> None:
+        for name in ("altitude_decay", "level_decay"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
 
 
 @dataclass(frozen=True)
@@ -205,12 +211,15 @@ class BiasedQuadrotor(Task):
 
     def _scene(self) -> SceneSpec:
         """A floor with lines, and posts with a band at the altitude of the hover: without them nothing shows a drift."""
-        hover = self.config.hover
+        c, hover = self.config, self.config.hover
+        # A body tilted further than by `flip_tilt` has turned over.
+        tilt = min(c.angle_range + c.angle_bias, hover.flip_tilt)
+        half_size = _FLOOR_PER_TIME * c.time_limit * math.tan(tilt)
         shapes: list[Shape] = [
             Box(
                 "floor",
                 (0.0, 0.0, -_FLOOR_HALF_HEIGHT),
-                (_FLOOR_HALF_SIZE, _FLOOR_HALF_SIZE, _FLOOR_HALF_HEIGHT),
+                (half_size, half_size, _FLOOR_HALF_HEIGHT),
                 colour=_FLOOR,
                 floor=True,
             )

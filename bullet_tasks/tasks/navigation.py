@@ -12,6 +12,7 @@ from bullet_tasks.ends import Ends
 from bullet_tasks.robots.base import RobotState
 from bullet_tasks.robots.quadruped_body import WALKING_SPEED, QuadrupedCommand
 from bullet_tasks.scene import SceneSpec
+from bullet_tasks.shapes import Box, Shape
 from bullet_tasks.tasks.base import Outcome, Task
 
 POSITION_SCALE = 8.0
@@ -21,6 +22,7 @@ MAX_TURN = math.pi / 4.0
 so no decision of 0.25 s can turn it further than this range allows, and a larger one would only make most actions the same."""
 FALL_HEIGHT = -0.25
 """A robot over ground lower than this has fallen, m (the authors' release)."""
+_MARGIN = 0.1  # m; a robot is that far beyond a floor's edge at most before it has fallen
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ class NavigationTask(Task):
     :param time_limit: s
     :param goal_radius: the base's centre within this distance of the goal has reached it, m
     :param reward: weights
-    :raises ValueError: if a time or the radius is not positive, or the periods do not fit into the time limit
+    :raises ValueError: if a time or the radius is not positive, or the periods do not fit into the time limit; from setting
+        ``scene``, if a floor reaches further than ``POSITION_SCALE`` or nobody could fall from it
     """
 
     def __init__(self, decision_period: float, time_limit: float, goal_radius: float, reward: NavigationReward) -> None:
@@ -72,6 +75,26 @@ class NavigationTask(Task):
         self.common_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._distance = 0.0
         self._heading_error = 0.0
+
+    @property
+    def scene(self) -> SceneSpec:
+        """The world as it is built."""
+        return self._whole_scene
+
+    @scene.setter
+    def scene(self, scene: SceneSpec) -> None:
+        if scene.lower_ground >= FALL_HEIGHT:
+            raise ValueError(
+                f"The ground beside the floor, at {scene.lower_ground} m, must be lower than {FALL_HEIGHT} m, where a robot "
+                "has fallen: raise `drop`."
+            )
+        reach = max((_reach(shape) for shape in scene.shapes if shape.floor and shape.top > FALL_HEIGHT), default=0.0)
+        if reach > POSITION_SCALE - _MARGIN:
+            raise ValueError(
+                f"The floor reaches {reach:.2f} m from the middle, but positions are observed in units of {POSITION_SCALE} m: "
+                f"it may reach {POSITION_SCALE - _MARGIN} m."
+            )
+        self._whole_scene = scene
 
     @abstractmethod
     def privileged(self) -> np.ndarray:
@@ -131,3 +154,13 @@ class NavigationTask(Task):
         """
         pose = (state.x / POSITION_SCALE, state.y / POSITION_SCALE, math.cos(state.yaw), math.sin(state.yaw))
         return np.array(pose, dtype=np.float32)
+
+
+def _reach(shape: Shape) -> float:
+    """The greatest absolute x or y of a shape's points, m."""
+    x, y = abs(shape.centre[0]), abs(shape.centre[1])
+    if not isinstance(shape, Box):
+        return max(x, y) + shape.radius
+    c, s = abs(math.cos(shape.yaw)), abs(math.sin(shape.yaw))
+    half_x, half_y, _ = shape.half_extents
+    return max(x + c * half_x + s * half_y, y + s * half_x + c * half_y)

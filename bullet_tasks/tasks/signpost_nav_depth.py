@@ -42,7 +42,7 @@ class SignpostNavDepth(SignpostNav):
 
     Differences from the paper and its release
         As for ``SignpostNav``. Images have 48 x 36 pixels of the same view instead of 87 x 58, which are there with
-        ``lens=camera.RELEASE``; they are of the moment of the decision instead of renewed every 0.1 s, and the camera has no
+        ``lens="release"``; they are of the moment of the decision instead of renewed every 0.1 s, and the camera has no
         random pitch.
 
     Source
@@ -58,7 +58,7 @@ def make_env(
     physics: str = "kinematic",
     render_mode: str | None = None,
     config: SignpostNavConfig | Mapping[str, Any] | None = None,
-    lens: Intrinsics = SMALL,
+    lens: Intrinsics | str = SMALL,
     back_end: str = "compiled",
 ) -> RobotTaskEnv:
     """
@@ -67,7 +67,7 @@ def make_env(
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
     :param config: sizes, times and weights, whole or the values that are different
-    :param lens: of the camera, see ``bullet_tasks.sensors.camera``
+    :param lens: of the camera, or the name of one of ``bullet_tasks.sensors.camera.LENSES``
     :param back_end: who takes the images, see ``DepthCamera``
     :raises ValueError: if an argument is not a possible choice
     """

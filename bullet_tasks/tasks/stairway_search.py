@@ -18,7 +18,7 @@ from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
 from bullet_tasks.tasks.configuration import configured
 from bullet_tasks.tasks.corners import CORNERS, CornerTask, quarter_turns
-from bullet_tasks.tasks.navigation import MAX_TURN, NavigationReward
+from bullet_tasks.tasks.navigation import FALL_HEIGHT, MAX_TURN, NavigationReward
 from bullet_tasks.tasks.seeing import make_seeing_env
 
 MAX_PITCH = math.pi / 6.0
@@ -73,10 +73,10 @@ class StairwaySearchConfig:
                 f"`corner` must be within half of `corner_reach` of `half_side` ({self.half_side} m), where a corner platform "
                 f"is joined to the square one, got {self.corner}."
             )
-        if not 0.0 < self.step_height < 0.5 * self.drop:
+        if not -FALL_HEIGHT < self.step_height < 0.5 * self.drop:
             raise ValueError(
-                f"`step_height` must be positive and less than half of `drop` ({self.drop} m), as there are two steps, "
-                f"got {self.step_height}."
+                f"`step_height` must be more than {-FALL_HEIGHT} m, or who steps down has not fallen, and less than half of "
+                f"`drop` ({self.drop} m), as there are two steps, got {self.step_height}."
             )
         upper, lower = self.step_reach
         if not self.corner_reach < upper < lower < 2.0 * self.corner:
@@ -141,7 +141,7 @@ class StairwaySearch(CornerTask):
         ``physics="kinematic"``, hence none of the small locomotion rewards, no falls by tipping over, and a flat floor
         without the +-2 cm roughness. Goal and dead zones count at once, not after three and six control steps, and the
         goal's circle is not wider for who stays there. One who steps down the stairs has fallen. Images have 48 x 36 pixels
-        of the same view instead of 87 x 58, which are there with ``lens=camera.RELEASE``; they are of the moment of the
+        of the same view instead of 87 x 58, which are there with ``lens="release"``; they are of the moment of the
         decision instead of renewed every 0.1 s, and the camera has no random pitch.
 
     Source
@@ -240,7 +240,7 @@ def make_env(
     physics: str = "kinematic",
     render_mode: str | None = None,
     config: StairwaySearchConfig | Mapping[str, Any] | None = None,
-    lens: Intrinsics = SMALL,
+    lens: Intrinsics | str = SMALL,
     back_end: str = "compiled",
 ) -> RobotTaskEnv:
     """
@@ -249,7 +249,7 @@ def make_env(
     :param physics: of the robot, see ``make_quadruped``
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
     :param config: sizes, times and weights, whole or the values that are different
-    :param lens: of the camera, see ``bullet_tasks.sensors.camera``
+    :param lens: of the camera, or the name of one of ``bullet_tasks.sensors.camera.LENSES``
     :param back_end: who takes the images, see ``DepthCamera``
     :raises ValueError: if an argument is not a possible choice
     """

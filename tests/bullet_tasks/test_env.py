@@ -121,10 +121,8 @@ def test_time_limit_truncates(env_id):
     env.close()
 
 
-@pytest.mark.parametrize("view", ["top", "follow"])
-def test_pictures_show_the_robot_move(env_id, view):
+def test_pictures_show_the_robot_move(env_id):
     env = gymnasium.make(env_id, render_mode="rgb_array")
-    env.unwrapped.view = view
     env.reset(seed=0)
     before = env.render()
     for _ in range(6):
@@ -235,10 +233,50 @@ def test_a_sensor_yields_the_target_observation(env_id):
     env.close()
 
 
+def test_a_step_needs_a_reset(env_id):
+    env = gymnasium.make(env_id)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        env.step(env.action_space.sample())
+    env.close()
+
+
+def test_actions_are_clipped_to_the_tasks_own_bounds(env_id):
+    class Wide(LateralChoice):
+        def __init__(self):
+            super().__init__()
+            self.action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+            self.seen = []
+
+        def command(self, action, state):
+            self.seen.append(action[0])
+            return super().command(action, state)
+
+    env = RobotTaskEnv(make_quadruped, Wide())
+    env.reset(seed=0)
+    for value in (-3.0, -1.5, 1.7, 2.5):
+        env.step(np.array([value], np.float32))
+    env.close()
+    assert env.task.seen == pytest.approx([-2.0, -1.5, 1.7, 2.0])
+
+
+def test_closing_closes_the_sensors(env_id):
+    class Held(Compass):
+        closed = 0
+
+        def close(self):
+            self.closed += 1
+
+    sensor = Held()
+    RobotTaskEnv(make_quadruped, LateralChoice(), sensors=(sensor,)).close()
+    assert sensor.closed == 1
+
+
+def test_a_film_has_a_frame_rate(env_id):
+    assert gymnasium.make(env_id).metadata["render_fps"] >= 1
+
+
 def test_impossible_compositions_are_refused(env_id):
     with pytest.raises(ValueError, match="one sensor"):
         RobotTaskEnv(make_quadruped, LateralChoice(), sensors=(Compass(), Compass()))
-    with pytest.raises(ValueError, match="view"):
-        RobotTaskEnv(make_quadruped, LateralChoice(), view="inside")
     with pytest.raises(ValueError, match="whole number"):
         RobotTaskEnv(make_quadruped, LateralChoice(LateralChoiceConfig(decision_period=0.12)))

@@ -98,6 +98,19 @@ def test_the_compiled_one_is_the_kinematic_one(make):
     assert 0.1 < landed < 0.9, "the flights are about landing and taking off"
 
 
+def test_pybullet_and_the_compiled_ground_agree_to_a_hundredth_of_a_millimetre(make):
+    robot = make("kinematic")
+    touched = []
+    for roll, pitch in np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2)):
+        for gap in (-1e-5, 1e-5):
+            height = kernels.TOUCH + gap + kernels.reach_down(robot._body, roll, pitch)
+            robot._flight[[kernels.Z, kernels.ROLL, kernels.PITCH]] = height, roll, pitch
+            robot._show()
+            touched.append(robot._touches())
+            assert touched[-1] == kernels.touches(robot._flight, robot._body) == (gap < 0.0), (roll, pitch, gap)
+    assert sum(touched) == 50
+
+
 def test_the_full_one_flies_like_the_others(make):
     for seed in range(3):
         rng = np.random.default_rng(seed)

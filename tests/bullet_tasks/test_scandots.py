@@ -122,22 +122,6 @@ def test_what_only_guides_the_eye_is_not_sensed():
     assert (scandots_in(marker).read(state()) == np.float32(0.8)).all()
 
 
-def test_many_robots_read_what_each_would_alone():
-    rng = np.random.default_rng(0)
-    # Scenes of different sizes, one of them without any shape.
-    scenes = [random_scene(rng, n_boxes=n) for n in range(5)] + [SceneSpec((), -0.3)]
-    poses = random_poses(rng, len(scenes), 2.0)
-    sensor = Scandots()
-    together = sensor.scan(pack(scenes), poses)
-    for scene, pose, readings in zip(scenes, poses, together, strict=True):
-        sensor.reset(scene, rng)
-        alone = sensor.read(state(*pose))
-        assert np.array_equal(alone, readings)
-    assert len(np.unique(together.round(3))) > 8
-    with pytest.raises(ValueError, match=r"\(6, 4\)"):
-        sensor.scan(pack(scenes), poses[:-1])
-
-
 def test_a_reading_belongs_to_its_receiver():
     sensor = scandots_in(Box("wall", (1.0, 0.0, 0.5), (0.2, 0.2, 0.5)))
     first = sensor.read(state())

@@ -323,7 +323,12 @@ def test_impossible_worlds_are_refused(arguments, words):
         StairwaySearch(StairwaySearchConfig(**arguments))
 
 
-@pytest.mark.parametrize("arguments", [{"physics": "magic"}, {"back_end": "opengl"}])
+@pytest.mark.parametrize("arguments", [{"physics": "magic"}, {"back_end": "opengl"}, {"lens": "fisheye"}])
 def test_unknown_choices_are_refused(env, arguments):
-    with pytest.raises(ValueError, match=r"magic|opengl"):
+    with pytest.raises(ValueError, match=r"magic|opengl|fisheye.*release.*small"):
         gymnasium.make(env.spec.id, **arguments)
+
+
+def test_a_lens_is_given_by_its_name(env):
+    named, given = (gymnasium.make(env.spec.id, physics="compiled", lens=lens) for lens in ("release", RELEASE))
+    assert named.observation_space == given.observation_space != env.observation_space

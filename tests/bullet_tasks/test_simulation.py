@@ -23,14 +23,14 @@ def drop(simulation):
     return simulation.add_body("cube", CUBE, (CUBE,), (0.0, 0.0, 1.2), mass=2.0)
 
 
-def test_contacts_are_told_by_name(simulation):
+def test_what_presses_on_a_body_is_felt_by_its_force(simulation):
     body = drop(simulation)
-    assert simulation.contact_forces("cube") == {}
+    simulation.step()
+    assert not simulation.pressed(body, threshold=0.1)
     for _ in range(180):
         simulation.step()
-    assert simulation.contact_forces("cube") == {"table": pytest.approx(2.0 * 9.81, rel=0.02)}
-    assert simulation.contact_forces("table") == {"cube": pytest.approx(2.0 * 9.81, rel=0.02)}
-    assert simulation.pressed(body, threshold=0.1)
+    # Four corners bear the cube's weight.
+    assert simulation.pressed(body, threshold=0.1) and not simulation.pressed(body, threshold=2.0 * 9.81)
 
 
 def test_a_saved_state_comes_back(simulation):
@@ -44,7 +44,6 @@ def test_a_saved_state_comes_back(simulation):
     assert simulation.client.getBasePositionAndOrientation(body) != pose
     simulation.restore(handle)
     assert simulation.client.getBasePositionAndOrientation(body) == pose
-    simulation.forget(handle)
 
 
 def test_names_are_unique_and_unknown_ones_are_refused(simulation):
@@ -69,12 +68,6 @@ def test_a_picture_shows_a_body_in_its_colour_and_size(simulation, shape):
     assert red[40, 60] and not red[5, 5]
     # The top face is 1 m wide, 5.5 m away and seen at 40 degrees over 80 pixels: 20 pixels wide.
     assert red[40].sum() == pytest.approx(20, abs=2)
-
-
-def test_a_following_camera_looks_the_robots_way():
-    camera = Camera.following((1.0, 2.0, 0.3), yaw=np.pi / 2)
-    assert camera.eye[1] < 2.0 < camera.target[1]
-    assert camera.eye[0] == pytest.approx(1.0) and camera.eye[2] > 0.3
 
 
 def test_closing_twice_closes_once():

@@ -394,6 +394,7 @@ def test_actions_of_a_type_that_does_not_fit_are_refused(env):
         ({"env_fns": []}, "empty"),
         ({"env_fns": toys(2), "n_workers": 3}, "n_workers"),
         ({"env_fns": toys(2), "n_workers": 0}, "n_workers"),
+        ({"env_fns": toys(2), "n_workers": 1.5}, "whole number"),
         ({"env_fns": toys(2), "start_method": "teleport"}, "start_method"),
         ({"env_fns": toys(1, observation_space=spaces.Discrete(3))}, "Dict of Box"),
         ({"env_fns": toys(1, observation_space=spaces.Dict({"a": spaces.Dict({"b": OBSERVATION_SPACES[0]})}))}, "Dict of Box"),
