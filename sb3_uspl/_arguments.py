@@ -55,13 +55,7 @@ def check_arguments(model: "USPLPPO") -> None:
             f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give "
             "them finite bounds, or use blur_noise='gaussian'."
         )
-    n_action = get_flattened_obs_dim(model.action_space)
-    if model.action_std is not None:
-        stds = np.asarray(model.action_std, dtype=float)
-        if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():
-            raise ValueError(
-                f"action_std={model.action_std}: give one positive number, or one for each of the {n_action} action values."
-            )
+    check_action_std(model.action_std, model.action_space)
     model.wander_actions = checked_wander_actions(model.wander_actions, model.action_space)
     ranges = {
         "warmup_timesteps": (model.warmup_timesteps or 0, 0, np.inf),
@@ -161,6 +155,20 @@ def count_mismatched(model: "USPLPPO", lenient: bool = False) -> int:
         f"mismatch_fraction={fraction} of {n_envs} environment(s) is no pair to swap privileged observations: "
         f"use n_envs >= {needed}, a larger fraction, or mismatch_fraction=0."
     )
+
+
+def check_action_std(action_std: float | Sequence[float] | None, action_space: spaces.Space) -> None:
+    """
+    :param action_std: of a model
+    :param action_space: its actions
+    :raises ValueError: if it is neither a positive number nor one for each number of an action
+    """
+    if action_std is None:
+        return
+    n_action = get_flattened_obs_dim(action_space)
+    stds = np.asarray(action_std, dtype=float)
+    if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():
+        raise ValueError(f"action_std={action_std}: give one positive number, or one for each of the {n_action} of an action.")
 
 
 def in_decisions(name: str, times: tuple[float, float], decision_period: float) -> tuple[float, float]:

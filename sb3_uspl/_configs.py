@@ -7,20 +7,22 @@ import yaml
 
 CONFIGS = Path(__file__).resolve().parents[1] / "zoo_configs"
 
-INHERIT, EVERY = "inherit", "every"
+INHERIT, KEEP, EVERY = "inherit", "keep", "every"
 
 
 def load_entries(path: Path) -> dict[str, dict[str, Any]]:
     """
-    Read a zoo file, one entry an environment. Two more keys let algorithms share what should not differ between them::
+    Read a zoo file, one entry an environment. Three more keys let algorithms share what should not differ between them::
 
         inherit: uspl_ppo.yml    # the entries of that file, beside this one; what this file says goes over them
+        keep: [env_kwargs, gamma]  # of those entries nothing else; without it, all
         every: {blur: false}     # goes over every entry, inherited or not
         LateralChoice-v0: {...}  # goes over that entry, after ``every``
 
     :param path: YAML file
     :return: hyperparameters by environment
-    :raises ValueError: for a file that does not exist or is no mapping of mappings, or that inherits from itself
+    :raises ValueError: for a file that does not exist or is no mapping of mappings, that inherits from itself, or that keeps
+        what no inherited entry has
     """
     return _load(path, ())
 
@@ -36,7 +38,13 @@ def _load(path: Path, heirs: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
     if not isinstance(given, dict):
         raise ValueError(f"{path} holds a {type(given).__name__}; expected a mapping of environments to hyperparameters.")
     parent, every = given.pop(INHERIT, None), given.pop(EVERY, None) or {}
+    keep = given.pop(KEEP, None)
     entries = _load(path.parent / parent, (*heirs, path)) if parent else {}
+    if keep is not None:
+        unknown = sorted(set(keep) - {name for entry in entries.values() for name in entry})
+        if unknown:
+            raise ValueError(f"{path} keeps {unknown}, which no entry of {parent} has.")
+        entries = {env: {name: value for name, value in entry.items() if name in keep} for env, entry in entries.items()}
     wrong = [name for name, entry in {EVERY: every, **given}.items() if not isinstance(entry, dict)]
     if wrong:
         raise ValueError(f"{path}: the entries {wrong} are no mappings of hyperparameters.")

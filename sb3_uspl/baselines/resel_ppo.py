@@ -1,7 +1,9 @@
 """RESeL-PPO as the paper runs it (App. C.2): the deployment policy itself is trained, by PPO alone."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
@@ -12,6 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_uspl._arguments import check_action_std
 from sb3_uspl.baselines.resel_policy import RESeLPolicy
 from sb3_uspl.baselines.sequences import HistoryVecWrapper, SequenceRolloutBuffer
 from sb3_uspl.observations import check_normalization, check_observation_space
@@ -65,7 +68,7 @@ class RESeLPPO(PPO):
         max_grad_norm: float = 40.0,
         target_kl: float | None = 0.067,
         learning_rate_floor: float = 0.05,
-        action_std: float | None = 0.35,
+        action_std: float | Sequence[float] | None = 0.35,
         action_std_floor: float = 0.2,
         encoder_learning_rate: float | Schedule = 5e-5,
         context_length: int = 1024,
@@ -108,9 +111,9 @@ class RESeLPPO(PPO):
         self.rollout_buffer_kwargs = {**given, "context_length": self.context_length}
         super()._setup_model()
         self.rollout_buffer_kwargs = given
-        self._action_std_schedule: CosineSchedule | None = None
+        self._action_std_share: CosineSchedule | None = None
         if self.action_std is not None and isinstance(self.action_space, spaces.Box):
-            self._action_std_schedule = CosineSchedule(self.action_std, self.action_std_floor)
+            self._action_std_share = CosineSchedule(1.0, self.action_std_floor)
             self.policy.set_action_std(self.action_std)
         self._rollout_env = None
 
@@ -127,11 +130,9 @@ class RESeLPPO(PPO):
                 f"batch_size={self.batch_size} with n_steps={self.n_steps}: a minibatch holds whole environments, so "
                 "batch_size must be a multiple of n_steps."
             )
-        if self.context_length < 1 or (self.action_std is not None and self.action_std <= 0.0):
-            raise ValueError(
-                f"context_length={self.context_length}, action_std={self.action_std}: both must be positive (action_std=None "
-                "learns the standard deviation)."
-            )
+        if self.context_length < 1:
+            raise ValueError(f"context_length={self.context_length}: an episode has one decision at least.")
+        check_action_std(self.action_std, self.action_space)
 
     def learn(
         self: SelfRESeLPPO,
@@ -171,8 +172,9 @@ class RESeLPPO(PPO):
         wrapper, buffer = self._rollout_env, rollout_buffer
         assert wrapper is not None and env is self.env and isinstance(buffer, SequenceRolloutBuffer)
         assert self._last_episode_starts is not None
-        if self._action_std_schedule is not None:
-            self.policy.set_action_std(self._action_std_schedule(self._current_progress_remaining))
+        if self._action_std_share is not None:
+            assert self.action_std is not None
+            self.policy.set_action_std(self._action_std_share(self._current_progress_remaining) * np.asarray(self.action_std))
         buffer.keep_running(self._last_episode_starts)
         self._last_obs = wrapper.resume(*buffer.running_tokens())  # type: ignore[assignment]
         going_on = False

@@ -1,11 +1,8 @@
 """RESeLPPO: what it recomputes is what it did, nothing leaks, and PPO learns to remember."""
 
-import inspect
-
 import numpy as np
 import pytest
 import torch as th
-import yaml
 from gymnasium import spaces
 from gymnasium.wrappers import FilterObservation
 from stable_baselines3 import PPO
@@ -15,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_uspl import RESeLPolicy, RESeLPPO, USPLPolicy
-from sb3_uspl._zoo import ALGORITHMS, CONFIGS
+from sb3_uspl._zoo import ALGORITHMS
 from sb3_uspl.baselines.sequences import EMBEDDING
 from tests.sb3_uspl.toy import IMAGE, ToyEnv
 
@@ -373,13 +370,6 @@ def test_timeouts_are_bootstrapped_with_the_true_privileged_observation():
 
 def test_the_zoo_knows_it():
     assert ALGORITHMS["resel_ppo"] is RESeLPPO
-    zoo_keys = {"n_envs", "n_timesteps", "normalize", "env_wrapper", "callback", "env_kwargs", "monitor_kwargs"}
-    known = set(inspect.signature(RESeLPPO).parameters) | set(inspect.signature(PPO).parameters)
-    entries = yaml.safe_load((CONFIGS / "resel_ppo.yml").read_text())
-    assert {"LateralChoice-v0", "TargetReaching-v0", "default"} <= set(entries)
-    for entry in entries.values():
-        assert set(entry) - zoo_keys <= known and entry["batch_size"] % entry["n_steps"] == 0
-        assert set(eval(entry["policy_kwargs"], {"dict": dict})) <= set(inspect.signature(RESeLPolicy).parameters)
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------------
@@ -391,8 +381,9 @@ def test_the_zoo_knows_it():
         (dict(batch_size=40), "multiple of n_steps"),
         (dict(batch_size=8), "multiple of n_steps"),
         (dict(use_sde=True), "use_sde"),
-        (dict(action_std=0.0), "both must be positive"),
-        (dict(context_length=0), "both must be positive"),
+        (dict(action_std=0.0), "one positive number"),
+        (dict(action_std=[0.2, 0.3, 0.4]), "one positive number"),
+        (dict(context_length=0), "context_length=0"),
         (dict(learning_rate_floor=2.0), "share of its initial value"),
         (dict(policy=USPLPolicy), "subclass of RESeLPolicy"),
         (dict(policy_kwargs=dict(memory="lstm")), "the memories"),

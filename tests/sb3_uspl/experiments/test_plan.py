@@ -86,6 +86,25 @@ def test_the_baselines_share_uspls_entries(plan):
         assert all(entry == entries[0] for entry in entries)
 
 
+REFERENCES = ("resel_ppo", "recurrent_ppo", "frame_stacked_ppo")
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_those_without_a_privileged_policy_share_uspls_experience_and_discount(plan, name):
+    shared = ("env_kwargs", "n_steps", "n_epochs", "gamma", "gae_lambda", "learning_rate", "ent_coef", "n_timesteps")
+    for env in plan.experiments["table1"].envs + plan.experiments["table9"].envs:
+        ours, uspl = (plan.cell(each, env, 1, plan.budgets["cpu"]).hyperparameters for each in (name, "uspl"))
+        for key in shared if name != "resel_ppo" else (*shared, "n_envs", "action_std", "action_std_floor"):
+            assert ours.get(key) == uspl.get(key), (env, key)
+
+
+def test_the_sweep_of_table_11_is_the_papers(plan):
+    for env in plan.experiments["table11"].envs:
+        cells = [plan.cell(column, env, 1, plan.budgets["cpu"]) for column in plan.experiments["table11"].columns]
+        assert [cell.hyperparameters["blur_gain"] for cell in cells] == [1.0, 2.5, 5.0, 10.0, 20.0, 40.0]
+        assert plan.cell("uspl", env, 1, plan.budgets["paper"]).hyperparameters["blur_gain"] == 10.0
+
+
 def test_the_sweep_of_table_10_is_the_papers(plan):
     columns = plan.experiments["table10"].columns
     assert len(columns) == 7
@@ -131,6 +150,15 @@ def test_a_file_inherits(tmp_path):
         "default": {"x": 5, "z": 4},
         "B": {"x": 5, "y": 7, "z": 4},
     }
+
+
+def test_a_file_keeps_only_what_it_names(tmp_path):
+    (tmp_path / "base.yml").write_text("A: {x: 1, y: 2}\nB: {y: 3}\n")
+    (tmp_path / "heir.yml").write_text("inherit: base.yml\nkeep: [y]\nevery: {z: 4}\nA: {x: 6}\n")
+    assert load_entries(tmp_path / "heir.yml") == {"A": {"x": 6, "y": 2, "z": 4}, "B": {"y": 3, "z": 4}}
+    (tmp_path / "heir.yml").write_text("inherit: base.yml\nkeep: [y, w]\n")
+    with pytest.raises(ValueError, match=r"keeps \['w'\]"):
+        load_entries(tmp_path / "heir.yml")
 
 
 @pytest.mark.parametrize(
