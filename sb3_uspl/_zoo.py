@@ -209,13 +209,17 @@ def _after(name: str) -> list[str]:
 
 
 def use_default_folder() -> None:
-    """Add ``-f trained_agents`` to the command line unless it names a folder."""
-    if _value_of("-f", "--folder") is None:
-        sys.argv += ["-f", str(TRAINED_AGENTS)]
+    """Have the command line say ``-f trained_agents``, unless it names a folder."""
+    _put_first("-f", str(TRAINED_AGENTS))
 
 
 def use_default_config() -> None:
-    """Add ``-conf zoo_configs/<algo>.yml`` to the command line unless it names a configuration."""
+    """Have the command line say ``-conf zoo_configs/<algo>.yml``, unless it names a configuration."""
     config = CONFIGS / f"{_value_of('--algo')}.yml"
-    if _value_of("-conf", "--conf-file") is None and config.is_file():
-        sys.argv += ["-conf", str(config)]
+    if config.is_file():
+        _put_first("-conf", str(config))
+
+
+def _put_first(*option: str) -> None:
+    # What comes later counts, however it is abbreviated.
+    sys.argv[1:1] = option

@@ -51,16 +51,19 @@ def load_agent(
     log_path = os.path.dirname(model_path)
     model = load_model(algo, model_path)
     hyperparams, stats_path = get_saved_hyperparams(os.path.join(log_path, env_id), test_mode=True)
-    venv = create_test_env(
-        env_id,
-        n_envs=n_envs,
-        stats_path=stats_path,
-        seed=EVALUATION_SEED,
-        should_render=False,
-        hyperparams=hyperparams,
-        env_kwargs=env_kwargs,
-        vec_env_cls=BulletVecEnv,
-    )
+    try:
+        venv = create_test_env(
+            env_id,
+            n_envs=n_envs,
+            stats_path=stats_path,
+            seed=EVALUATION_SEED,
+            should_render=False,
+            hyperparams=hyperparams,
+            env_kwargs=env_kwargs,
+            vec_env_cls=BulletVecEnv,
+        )
+    except TypeError as error:
+        raise ValueError(f"{env_id} cannot be made with {env_kwargs or {}}: {error}") from error
     try:
         check_for_correct_spaces(venv, model.observation_space, model.action_space)
     except ValueError as error:
@@ -94,18 +97,23 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         _episode.REPLAY, type=Path, help=".html file to write: the first of the episodes in 3-D, with a timeline"
     )
-    return parser.parse_args()
+    given = parser.parse_args()
+    for name, least in (("episodes", 1), ("n_envs", 1), ("seed", 0)):
+        if getattr(given, name) < least:
+            parser.error(f"--{name.replace('_', '-')} {getattr(given, name)}: must be at least {least}.")
+    return given
 
 
 def main() -> None:
     """Evaluate and print."""
     arguments = parse_arguments()
-    if arguments.episodes < 1:
-        raise SystemExit(f"--episodes {arguments.episodes}: at least one episode is needed.")
-    register(arguments.gym_packages)
     th.set_num_threads(1)
     with contextlib.redirect_stdout(sys.stderr):  # the zoo prints too
-        result = _measure(arguments)
+        try:
+            register(arguments.gym_packages)
+            result = _measure(arguments)
+        except (ValueError, ModuleNotFoundError) as error:
+            raise SystemExit(str(error)) from error
     if arguments.json:
         print(json.dumps(result))
     else:
@@ -115,18 +123,12 @@ def main() -> None:
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     env_kwargs = {"physics": arguments.physics} if arguments.physics else None
     n_envs = min(arguments.n_envs, arguments.episodes)
-    try:
-        model, venv = load_agent(
-            arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs, env_kwargs
-        )
-    except ValueError as error:
-        raise SystemExit(str(error)) from error
+    model, venv = load_agent(
+        arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs, env_kwargs
+    )
     with contextlib.closing(venv):
         if arguments.replay is not None:
-            try:
-                _episode.write_replay_page(model, venv, arguments)
-            except ValueError as error:
-                raise SystemExit(str(error)) from error
+            _episode.write_replay_page(model, venv, arguments)
         result = evaluate(model, venv, arguments.episodes, arguments.seed, arguments.policy)
     return {"algo": arguments.algo, "env": arguments.env, "physics": arguments.physics, **result}
 

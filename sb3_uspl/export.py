@@ -25,6 +25,7 @@ from sb3_uspl.deployment import NEXT, DeploymentPolicy, Signal
 from sb3_uspl.observations import PRIVILEGED, UNCERTAINTY
 
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".pt"}
+_CARD = ".json"
 _ONNX_PACKAGES = ("onnx", "onnxscript")
 _TRACED_ROBOTS = 2
 """One would be taken for a constant of the graph."""
@@ -50,7 +51,8 @@ def export_policy(
     :param normalize: the environments' normalisation, if the model was trained under one
     :param notes: further entries of the card
     :return: the card
-    :raises ValueError: for an unknown format, a missing package or a policy that cannot be exported
+    :raises ValueError: for an unknown format, a file that cannot be written, a missing package or a policy that cannot be
+        exported
     """
     if file_format not in SUFFIXES:
         raise ValueError(f"format='{file_format}': choose one of {sorted(SUFFIXES)}.")
@@ -59,6 +61,8 @@ def export_policy(
         raise ValueError(
             f'ONNX needs {missing}, which the extra brings: pip install -e ".[export]". TorchScript does without.'
         )
+    if out.is_dir() or out.suffix == _CARD:
+        raise ValueError(f"{out} {'is a folder' if out.is_dir() else 'is what the card is called'}: name the policy's file.")
     policy = DeploymentPolicy(model.policy, horizon, normalize)
     path = out if out.suffix else out.with_suffix(SUFFIXES[file_format])
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +71,7 @@ def export_policy(
     period = getattr(model, "decision_period", None) if decision_period is None else decision_period
     head = {"file": path.name, "format": file_format, "algorithm": type(model).__name__, "decision_period_s": period}
     card = {**head, **_describe(policy), **notes}
-    path.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
+    path.with_suffix(_CARD).write_text(json.dumps(card, indent=2) + "\n")
     return card
 
 
@@ -173,7 +177,7 @@ def main() -> None:
     with contextlib.redirect_stdout(sys.stderr):  # the zoo prints too
         try:
             card = _export(arguments)
-        except ValueError as error:
+        except (ValueError, ModuleNotFoundError) as error:
             raise SystemExit(str(error)) from error
     print(f"{card['file']} and its card in {arguments.out.parent.resolve()}")
 
@@ -197,7 +201,7 @@ def _export(arguments: argparse.Namespace) -> dict[str, Any]:
         period = getattr(world, "decision_period", None)
         steps = env.spec.max_episode_steps if env.spec is not None else None
         text = (inspect.getdoc(getattr(world, "task", world)) or "").split(":param")[0].strip()
-    horizon = arguments.horizon or steps or getattr(model, "context_length", None) or 1024
+    horizon = arguments.horizon if arguments.horizon is not None else steps or getattr(model, "context_length", None) or 1024
     notes = {"environment": arguments.env, "units_and_task": text}
     return export_policy(model, arguments.out, arguments.format, horizon, period, normalize, **notes)
 

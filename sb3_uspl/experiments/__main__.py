@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_uspl.experiments.figures import Figures
+from sb3_uspl.experiments.figures import RECORDED, SINGLE, Figures
 from sb3_uspl.experiments.plan import Budget, Cell, Experiment, Plan, variant_of
 from sb3_uspl.experiments.provenance import ROOT, commit
 from sb3_uspl.experiments.results import MODELS, Results, collect, write_csv
@@ -25,6 +25,8 @@ def parse_arguments(plan: Plan, arguments: Sequence[str] | None = None) -> argpa
     :param arguments: command line; None: the process's
     :return: parsed and checked
     """
+    from sb3_uspl._zoo import EVALUATION_OFFSET
+
     parser = argparse.ArgumentParser(prog="python -m sb3_uspl.experiments", description=__doc__)
     parser.add_argument("experiments", nargs="+", choices=sorted(plan.experiments), metavar="experiment", help="table1, ...")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of the trainings")
@@ -39,8 +41,20 @@ def parse_arguments(plan: Plan, arguments: Sequence[str] | None = None) -> argpa
     )
     parser.add_argument("--logs", type=Path, default=Path("logs") / "experiments", help="trainings and checkpoints")
     given = parser.parse_args(arguments)
-    if given.jobs < 1 or min(given.seeds) < 0 or len(set(given.seeds)) < len(given.seeds):
-        parser.error("--jobs must be at least 1, and --seeds different numbers of at least 0.")
+    if given.jobs < 1:
+        parser.error(f"--jobs {given.jobs}: at least one cell has to run at a time.")
+    # Those of the evaluations during the training begin there, those of the final one still higher.
+    if min(given.seeds) < 0 or max(given.seeds) >= EVALUATION_OFFSET or len(set(given.seeds)) < len(given.seeds):
+        parser.error(f"--seeds must be different numbers of at least 0 and below {EVALUATION_OFFSET}, got {given.seeds}.")
+    if given.envs and len(set(given.envs)) < len(given.envs):
+        parser.error(f"--envs must be different environments, got {given.envs}.")
+    experiments = [plan.experiments[name] for name in given.experiments]
+    there = {variant_of(column) for experiment in experiments for column in experiment.columns}
+    if given.only and not set(given.only) <= there:
+        parser.error(f"--only {sorted(set(given.only) - there)}: {given.experiments} consist of {sorted(there)}.")
+    single = [experiment.name for experiment in experiments if experiment.kind in SINGLE]
+    if single and (len(given.envs or []) > 1 or len(given.seeds) > 1):
+        parser.error(f"{single} show one environment and one seed: give one with --envs and --seeds.")
     if given.output is None:
         # Nobody should take a smoke test's numbers for results.
         given.output = given.logs if given.budget == "smoke" else ROOT / "docs" / "results"
@@ -84,8 +98,9 @@ def _registered() -> set[str]:
 
     import bullet_tasks  # noqa: F401 (registers the environments)
     import sb3_uspl  # noqa: F401 (the same)
+    from sb3_uspl._zoo import is_ours
 
-    return set(gymnasium.registry)
+    return set(filter(is_ours, gymnasium.registry))
 
 
 def _cells(plan: Plan, experiment: Experiment, given: argparse.Namespace, budget: Budget, known: set[str]) -> list[Cell]:
@@ -99,7 +114,7 @@ def _show(
     folder = given.output / given.budget
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{experiment.name}.csv", plan, cells, results)
-    figures, picture = Figures(plan, results), folder / f"{experiment.name}.png"
+    figures, picture = Figures(plan, results, given.model), folder / f"{experiment.name}.png"
     if experiment.kind in TABLE_KINDS:
         summaries = collect(experiment, cells, results, given.seeds, given.model)
         body = [markdown(plan, experiment, summaries, missing), "", NOTES[experiment.kind]]
@@ -108,7 +123,8 @@ def _show(
         drawn = figures.draw(experiment, cells, picture)
         body = [f"No such task yet: {env}." for env in missing]
     unrun = [cell for cell in cells if not results.has(cell)]
-    model = "with the highest reward in the training's own evaluations" if given.model == "best" else "at the training's end"
+    best = given.model == "best" or experiment.kind in RECORDED
+    model = "with the highest reward in the training's own evaluations" if best else "at the training's end"
     text = [
         f"# {experiment.title}",
         "",

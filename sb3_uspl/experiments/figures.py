@@ -20,6 +20,10 @@ PANEL = (4.4, 3.2)
 """inches"""
 PATH_EPISODES, BELIEF_EPISODES = 8, 3
 _LIMIT = "#6B6B6B"
+SINGLE = ("belief", "forced")
+"""Kinds of figures that show one environment and one seed."""
+RECORDED = ("paths", *SINGLE)
+"""Kinds of figures that show recorded episodes, which are always the best model's."""
 
 
 class Figures:
@@ -28,10 +32,11 @@ class Figures:
 
     :param plan: for the labels
     :param results: measured cells
+    :param model: "best" or "last", where the figure is not one of ``RECORDED``
     """
 
-    def __init__(self, plan: Plan, results: Results):
-        self.plan, self.results = plan, results
+    def __init__(self, plan: Plan, results: Results, model: str = "best"):
+        self.plan, self.results, self.model = plan, results, model
         self._colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
 
     def draw(self, experiment: Experiment, cells: Sequence[Cell], path: Path) -> bool:
@@ -109,7 +114,8 @@ class Figures:
         for env, axis in zip(_envs(measured), axes, strict=True):
             error_axis = axis.twinx()
             for i, column in enumerate(experiment.columns):
-                models = [r["models"]["best"] for cell, r in measured if (cell.env, cell.variant) == (env, variant_of(column))]
+                shown = [result for cell, result in measured if (cell.env, cell.variant) == (env, variant_of(column))]
+                models = [result["models"][self.model] for result in shown]
                 for name, target, dashes in (
                     ("divergence_over_time", axis, "-"),
                     ("prediction_error_over_time", error_axis, "--"),

@@ -49,6 +49,7 @@ def measure(folder: CellFolder, target: Path) -> None:
             "wall_time": sum(state["wall_times"]),
             "attempts": len(state["wall_times"]),
             "jobs": max(state["jobs"], default=1),
+            "commits": state["commits"],
             "decisions": folder.decisions(),
             "seconds_per_iteration": folder.seconds_per_iteration(),
         },

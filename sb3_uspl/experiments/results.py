@@ -166,7 +166,8 @@ def collect(
 _CSV_COLUMNS = (
     *("variant", "label", "env", "seed", "model", "success_rate", "success_low", "success_high", "privileged_success_rate"),
     *("mean_return", "mean_length", "prediction_error_final", "divergence_mean", "episodes", "decisions", "wall_time"),
-    *("seconds_per_iteration", "attempts", "jobs", "evaluation_seed", "configuration", "commit", "processor", "cores"),
+    *("seconds_per_iteration", "attempts", "jobs", "evaluation_seed", "configuration", "trained_at", "commit", "processor"),
+    "cores",
 )
 
 
@@ -207,6 +208,8 @@ def _flat(result: dict[str, Any], model: str) -> dict[str, Any]:
         "seconds_per_iteration": training["seconds_per_iteration"],
         "attempts": training["attempts"],
         "jobs": training["jobs"],
+        # Of results from before it was noted, the commit of the training is not known.
+        "trained_at": " ".join(dict.fromkeys(map(str, training.get("commits", [])))),
         "commit": result["commit"],
         "processor": machine["processor"],
         "cores": machine["cores"],

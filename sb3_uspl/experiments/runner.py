@@ -83,7 +83,9 @@ class Grid:
         self.running: list[Job] = []
         self.failed: dict[str, str] = {}
         self._begin = time.monotonic()
-        self._trained_decisions = 0
+        self._left = {folder.cell.name: _decisions_left(folder) for folder in self.waiting}
+        self._trained: list[tuple[Cell, float, int]] = []
+        """Seconds and decisions of attempts that have ended."""
         self._measuring_times: list[float] = []
 
     def run(self) -> dict[str, str]:
@@ -172,7 +174,7 @@ class Grid:
             return
         # The zoo ends an interrupted training without an error.
         trained = status == 0 and folder.decisions() >= cell.timesteps
-        self._trained_decisions += max(folder.decisions() - job.first, 0)
+        self._trained.append((cell, time.monotonic() - job.begin, max(folder.decisions() - job.first, 0)))
         folder.add_attempt(time.monotonic() - job.begin, self.jobs, trained)
         if trained:
             self._measure(folder)
@@ -209,15 +211,8 @@ class Grid:
     def _report(self) -> None:
         training = [job for job in self.running if job.phase == "train"]
         now = {job.folder.cell.name: max(job.folder.decisions(), job.first) for job in training}
-        left = sum(folder.cell.timesteps for folder in self.waiting)
-        # The last rollout goes past the end.
-        left += sum(max(job.folder.cell.timesteps - now[job.folder.cell.name], 0) for job in training)
-        gone = self._trained_decisions + sum(now[job.folder.cell.name] - job.first for job in training)
-        elapsed = time.monotonic() - self._begin
-        measuring = sum(self._measuring_times) / max(len(self._measuring_times), 1)
-        unmeasured = len(self.waiting) + len(training)
-        seconds = left * elapsed / gone + unmeasured * measuring / self.jobs if gone else math.inf
-        remaining = f"about {_clock(seconds)} left" if gone else "no estimate yet"
+        seconds = self._seconds_left(training, now)
+        remaining = f"about {_clock(seconds)} left" if math.isfinite(seconds) else "no estimate yet"
         done = self.n_cells - len(self.waiting) - len(self.running)
         states = []
         for job in self.running:
@@ -225,8 +220,40 @@ class Grid:
             states.append(f"{job.folder.cell.variant} {job.folder.cell.env} seed {job.folder.cell.seed}: {share}")
         self._say(f"{done} of {self.n_cells} cells done | {' | '.join(states)} | {remaining}")
 
+    def _seconds_left(self, training: list[Job], now: dict[str, int]) -> float:
+        """At the speed of the trainings so far, if there were any of the same algorithm and environment at theirs."""
+        time_now = time.monotonic()
+        seen = [*self._trained]
+        seen += [(job.folder.cell, time_now - job.begin, now[job.folder.cell.name] - job.first) for job in training]
+
+        def seconds(cell: Cell, decisions: int) -> float:
+            same_env = [entry for entry in seen if entry[0].env == cell.env]
+            same = [entry for entry in same_env if entry[0].algo == cell.algo]
+            for entries in (same, same_env, seen):
+                if sum(gone for _, _, gone in entries):
+                    return decisions * sum(spent for _, spent, _ in entries) / sum(gone for _, _, gone in entries)
+            return math.inf if decisions else 0.0
+
+        measuring = sum(self._measuring_times) / max(len(self._measuring_times), 1)
+        # The last rollout goes past the end.
+        running = [
+            seconds(job.folder.cell, max(job.folder.cell.timesteps - now[job.folder.cell.name], 0)) + measuring
+            if job.phase == "train"
+            else max(measuring - (time_now - job.begin), 0.0)
+            for job in self.running
+        ]
+        waiting = [seconds(folder.cell, self._left[folder.cell.name]) + measuring for folder in self.waiting]
+        return max([sum(running + waiting) / self.jobs, *running])
+
     def _say(self, text: str) -> None:
         print(f"[{_clock(time.monotonic() - self._begin)}] {text}", flush=True)
+
+
+def _decisions_left(folder: CellFolder) -> int:
+    if folder.state["trained"]:
+        return 0
+    checkpoint = folder.checkpoint()
+    return folder.cell.timesteps - (checkpoint[1] if checkpoint else 0)
 
 
 def _end_of(log: Path) -> str:

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import math
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 import yaml
 
 from sb3_uspl.experiments.plan import Cell
+from sb3_uspl.experiments.provenance import commit
 
 CHECKPOINT = "rl_model_*_steps.zip"
 CHECKPOINTS_PER_TRAINING = 20
@@ -25,6 +28,14 @@ class Attempt:
 
     path: Path
     number: int
+
+    @property
+    def first(self) -> int:
+        """Decisions after which it continues another one; 0 if it begins at the beginning."""
+        given = next(self.path.glob("*/args.yml"), None)
+        # The zoo's file names Python's own classes.
+        found = None if given is None else re.search(r"rl_model_(\d+)_steps", given.read_text())
+        return int(found[1]) if found else 0
 
 
 class CellFolder:
@@ -54,10 +65,13 @@ class CellFolder:
 
     @property
     def state(self) -> dict[str, Any]:
-        """``wall_times`` (s) of the attempts, ``jobs`` at the same time, whether the training is ``trained`` to its end."""
+        """
+        ``wall_times`` (s) of the attempts, ``jobs`` at the same time, ``commits`` of the code, and whether the training is
+        ``trained`` to its end.
+        """
         if not self._state.is_file():
-            return {"wall_times": [], "jobs": [], "trained": False}
-        return json.loads(self._state.read_text())
+            return {"wall_times": [], "jobs": [], "commits": [], "trained": False}
+        return {"commits": [], **json.loads(self._state.read_text())}
 
     def add_attempt(self, wall_time: float, jobs: int, trained: bool) -> None:
         """
@@ -68,6 +82,7 @@ class CellFolder:
         state = self.state
         state["wall_times"].append(wall_time)
         state["jobs"].append(jobs)
+        state["commits"].append(commit())
         state["trained"] = trained
         self._state.write_text(json.dumps(state))
 
@@ -113,10 +128,16 @@ class CellFolder:
     def best_attempt(self) -> Attempt | None:
         """:return: the one whose best model had the highest reward of all in the evaluations during the training"""
         scored = []
-        for attempt in self.attempts():
+        attempts = self.attempts()
+        for i, attempt in enumerate(attempts):
             results = evaluations(attempt.path)
-            if results is not None and (attempt.path / "best_model.zip").is_file():
-                scored.append((float(results["results"].mean(axis=1).max()), -attempt.number, attempt))
+            if results is None or not (attempt.path / "best_model.zip").is_file():
+                continue
+            rewards = results["results"].mean(axis=1)
+            # What an attempt did after the checkpoint that a later one continues has not happened.
+            end = min((later.first for later in attempts[i + 1 :]), default=math.inf)
+            if results["timesteps"][rewards.argmax()] <= end:
+                scored.append((float(rewards.max()), -attempt.number, attempt))
         return max(scored)[2] if scored else None
 
     def learning_curve(self) -> dict[str, list[float]]:
@@ -127,8 +148,8 @@ class CellFolder:
             if saved is None:
                 continue
             steps = saved["timesteps"].tolist()
-            # What an earlier attempt did after the checkpoint that this one continues has not happened.
-            curve = {step: value for step, value in curve.items() if step < steps[0]}
+            # As in ``best_attempt``.
+            curve = {step: value for step, value in curve.items() if step <= attempt.first}
             success = saved["successes"].mean(axis=1) if "successes" in saved else np.full(len(steps), np.nan)
             curve |= dict(zip(steps, zip(success.tolist(), saved["results"].mean(axis=1).tolist(), strict=True), strict=True))
         return {

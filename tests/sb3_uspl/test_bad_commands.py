@@ -1,5 +1,6 @@
 """What is wrong with a command is said in a sentence, with what to do; never by a traceback."""
 
+import re
 import shutil
 import sys
 
@@ -164,3 +165,41 @@ def test_tracking_is_the_zoos(tmp_path, monkeypatch):
     assert given["project"] == "looking" and given["sync_tensorboard"] and given["config"]["algo"] == "uspl_ppo"
     assert given["later"]["saved_hyperparams"]["n_envs"] == 8
     assert list((tmp_path / "runs").glob("**/events.out.tfevents*")), "what W&B would read"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--physics", "full"), "cannot be made with.*'physics'"),
+        (("--seed", "-5"), "--seed -5: must be at least 0"),
+        (("--n-envs", "0"), "--n-envs 0: must be at least 1"),
+        (("--episodes", "0"), "--episodes 0: must be at least 1"),
+        (("--gym-packages", "nosuch"), "No module named 'nosuch'"),
+    ],
+)
+def test_an_evaluation_that_cannot_be_is_refused(arguments, words):
+    assert re.search(words, refused("sb3_uspl.evaluate", "--env", ENV, "--episodes", "2", *arguments))
+
+
+@pytest.mark.parametrize(("name", "words"), [("policy.json", "what the card is called"), ("", "is a folder")])
+def test_an_export_that_would_overwrite_itself_is_refused(tmp_path, name, words):
+    where = ("--env", ENV, "--format", "torchscript", "-o", str(tmp_path / name))
+    assert words in refused("sb3_uspl.export", *where)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("table1", "--envs", ENV, ENV), "--envs must be different"),
+        (("table1", "--envs", "CartPole-v1"), "There are no environments"),
+        (("table1", "--seeds", "1000000"), "below 500000"),
+        (("table8", "--only", "k_5"), r"--only \['k_5'\]"),
+        (("figure7", "--envs", "BiasedQuadrotor-v0", "LateralChoice-v0"), "one environment and one seed"),
+        (("figure7", "--seeds", "1", "2"), "one environment and one seed"),
+        (("table1", "--jobs", "0"), "--jobs 0"),
+    ],
+)
+def test_an_experiment_that_would_mislead_is_refused(tmp_path, arguments, words):
+    options = ("--budget", "smoke", "--no-train", "--logs", str(tmp_path))
+    assert re.search(words, refused("sb3_uspl.experiments", *arguments, *options))

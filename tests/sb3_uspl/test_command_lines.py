@@ -1,5 +1,6 @@
 """The commands of the README, small: train with the zoo, evaluate, watch, plot."""
 
+import argparse
 import csv
 import inspect
 import json
@@ -177,17 +178,26 @@ def test_importing_the_package_does_not_import_the_zoo_or_pybullet():
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
 
 
-@pytest.mark.parametrize("given", [["-conf", "mine.yml", "-f", "logs"], ["--conf-file=mine.yml", "--folder=logs"]])
-def test_what_the_command_line_says_is_not_replaced_by_defaults(monkeypatch, given):
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ([], (str(CONFIGS / "rma.yml"), str(TRAINED_AGENTS))),
+        (["-conf", "mine.yml", "-f", "logs"], ("mine.yml", "logs")),
+        (["--conf-file=mine.yml", "--folder=logs"], ("mine.yml", "logs")),
+        (["--conf", "mine.yml", "--fold", "logs"], ("mine.yml", "logs")),
+    ],
+)
+def test_what_the_command_line_says_is_not_replaced_by_defaults(monkeypatch, given, expected):
+    zoo = argparse.ArgumentParser()
+    zoo.add_argument("--algo")
+    zoo.add_argument("-conf", "--conf-file")
+    zoo.add_argument("-f", "--folder")
     for algo in (["--algo", "rma"], ["--algo=rma"]):
-        monkeypatch.setattr(sys, "argv", ["train", *algo])
+        monkeypatch.setattr(sys, "argv", ["train", *algo, *given])
         use_default_config()
         use_default_folder()
-        assert sys.argv[-4:] == ["-conf", str(CONFIGS / "rma.yml"), "-f", str(TRAINED_AGENTS)]
-        monkeypatch.setattr(sys, "argv", before := ["train", *algo, *given])
-        use_default_config()
-        use_default_folder()
-        assert sys.argv == before
+        parsed = zoo.parse_args()
+        assert (parsed.conf_file, parsed.folder) == expected
 
 
 @pytest.mark.parametrize("algo", sorted(ALGORITHMS))

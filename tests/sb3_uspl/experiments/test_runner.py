@@ -1,11 +1,13 @@
 """A grid whatever happens to it: cells are trained once, go on where they stopped, and do not hold each other up."""
 
 import json
+import math
 import re
 import signal
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sb3_uspl.experiments.plan import Cell, Plan
@@ -212,6 +214,44 @@ def test_no_time_is_left_where_the_last_rollout_goes_past_the_end(tmp_path, cell
         patch.setattr("sb3_uspl.experiments.runner.REPORT_PERIOD", 0.0)
         grid.run()
     assert "about 0:00:00 left" in capsys.readouterr().out
+
+
+def test_the_time_left_counts_every_cell_at_its_own_speed(tmp_path):
+    budget = PLAN.budgets["smoke"]
+    slow, fast, neither = (
+        PLAN.cell("uspl", env, 2, budget) for env in ("ActiveTMaze-v0", "TargetReaching-v0", "LateralChoice-v0")
+    )
+    other = PLAN.cell("resel_ppo", "TargetReaching-v0", 2, budget)
+    grid = Grid([slow, fast, neither, other], tmp_path / "logs", Results(tmp_path / "raw"), 2, FakeMachine())
+    assert grid._seconds_left([], {}) == math.inf
+    grid._trained, grid._measuring_times = [(slow, 300.0, 100), (fast, 10.0, 100)], [1.0, 3.0]
+    expected = 256 * (3.0 + 0.1 + 310.0 / 200 + 0.1) + 4 * 2.0
+    assert grid._seconds_left([], {}) == pytest.approx(expected / 2)
+    # What has been trained already needs to be measured only; what has a checkpoint, the rest.
+    folder = CellFolder(tmp_path / "logs", slow)
+    folder.create()
+    folder.add_attempt(1.0, 1, trained=True)
+    again = Grid([slow], tmp_path / "logs", Results(tmp_path / "raw"), 1, FakeMachine())
+    again._measuring_times = [2.0]
+    assert again._seconds_left([], {}) == 2.0
+
+
+def test_what_was_done_after_the_checkpoint_that_is_continued_has_not_happened(tmp_path, cells):
+    folder = CellFolder(tmp_path, cells[0])
+    # Evaluations at these decisions had these rewards; the second attempt continues after 20,000 decisions.
+    attempts = {1: ({10_000: 1.0, 20_000: 2.0, 30_000: 9.0}, ""), 2: ({29_000: 3.0, 39_000: 1.0}, "rl_model_20000_steps.zip")}
+    for number, (rewards, continued) in attempts.items():
+        path = folder.train / cells[0].algo / f"{cells[0].env}_{number}"
+        (path / cells[0].env).mkdir(parents=True)
+        (path / cells[0].env / "args.yml").write_text(f"- - trained_agent\n  - {continued}\n")
+        (path / "best_model.zip").touch()
+        results = np.array(list(rewards.values()))[:, None]
+        np.savez(path / "evaluations.npz", timesteps=list(rewards), results=results, successes=results > 1.0)
+    assert [attempt.first for attempt in folder.attempts()] == [0, 20_000]
+    curve = folder.learning_curve()
+    assert curve["timesteps"] == [10_000, 20_000, 29_000, 39_000] and curve["reward"] == [1.0, 2.0, 3.0, 1.0]
+    best = folder.best_attempt()
+    assert best is not None and best.number == 2, "the best model of the first one is of decision 30,000"
 
 
 def test_no_more_children_than_jobs(tmp_path, cells):
