@@ -10,7 +10,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_uspl.buffers import USPLRolloutBuffer
-from sb3_uspl.observations import COMMON, PRIVILEGED, check_normalization, check_observation_space
+from sb3_uspl.observations import COMMON, PRIVILEGED, check_observation_space, check_vec_wrappers
 from sb3_uspl.policies import USPLPolicy
 from sb3_uspl.symmetries import Symmetry, SymmetryGroup
 
@@ -30,7 +30,7 @@ def check_arguments(model: "USPLPPO") -> None:
     """
     space = check_observation_space(model.observation_space)[PRIVILEGED]
     if model.env is not None:
-        check_normalization(model.env)
+        check_vec_wrappers(model.env)
     assert isinstance(space, spaces.Box)
     if not issubclass(model.policy_class, USPLPolicy):
         raise ValueError(f"USPLPPO needs a subclass of sb3_uspl.USPLPolicy as policy; {model.policy_class} was given.")
@@ -55,7 +55,7 @@ def check_arguments(model: "USPLPPO") -> None:
             f"The privileged space {space} has unbounded dimensions, which uniform blurring cannot clip (Eq. 3): give "
             "them finite bounds, or use blur_noise='gaussian'."
         )
-    check_action_std(model.action_std, model.action_space)
+    check_action_std(model.action_std, model.action_space, model.policy_kwargs)
     model.wander_actions = checked_wander_actions(model.wander_actions, model.action_space)
     ranges = {
         "warmup_timesteps": (model.warmup_timesteps or 0, 0, np.inf),
@@ -157,14 +157,22 @@ def count_mismatched(model: "USPLPPO", lenient: bool = False) -> int:
     )
 
 
-def check_action_std(action_std: float | Sequence[float] | None, action_space: spaces.Space) -> None:
+def check_action_std(
+    action_std: float | Sequence[float] | None, action_space: spaces.Space, policy_kwargs: dict[str, Any]
+) -> None:
     """
     :param action_std: of a model
     :param action_space: its actions
-    :raises ValueError: if it is neither a positive number nor one for each number of an action
+    :param policy_kwargs: of a model
+    :raises ValueError: if it is neither a positive number nor one for each number of an action, or is given twice
     """
     if action_std is None:
         return
+    if "log_std_init" in policy_kwargs:
+        raise ValueError(
+            f"policy_kwargs sets log_std_init, but action_std={action_std} fixes the standard deviation of the actions: give "
+            "that, or action_std=None to have it learned from log_std_init on."
+        )
     n_action = get_flattened_obs_dim(action_space)
     stds = np.asarray(action_std, dtype=float)
     if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():

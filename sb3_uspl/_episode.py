@@ -41,6 +41,7 @@ def parse_arguments(command: str) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode")
     parser.add_argument("--episodes", type=int, default=1, help="episodes of a film, one after the other")
     parser.add_argument("--physics", help="fidelity of the robot; default: the environment's")
+    add_env_kwargs(parser)
     parser.add_argument(
         "--uncertainty",
         help="shown to the policy instead of the encoder's, in a film: a number, or a .csv file with the columns "
@@ -61,6 +62,16 @@ def parse_arguments(command: str) -> argparse.Namespace:
     return arguments
 
 
+def add_env_kwargs(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of a command line that takes arguments for the environment, as the zoo's do
+    """
+    from rl_zoo3.utils import StoreDict
+
+    text = "arguments of the environment, e.g. length:6 name:\"'a'\"; default: none, whatever the agent was trained with"
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, default={}, metavar="NAME:VALUE", help=text)
+
+
 def write(arguments: argparse.Namespace) -> None:
     """
     Write the film or the page.
@@ -71,7 +82,8 @@ def write(arguments: argparse.Namespace) -> None:
     from sb3_uspl.evaluate import load_agent
 
     uncertainty = read_uncertainty(arguments.uncertainty) if arguments.uncertainty is not None else None
-    model, venv = load_agent(arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs=1)
+    given, kwargs = (arguments.algo, arguments.env, arguments.folder, arguments.exp_id), env_kwargs(arguments)
+    model, venv = load_agent(*given, arguments.load_best, n_envs=1, env_kwargs=kwargs)
     venv.close()
     if arguments.film is None:
         write_replay_page(model, venv, arguments)
@@ -80,7 +92,7 @@ def write(arguments: argparse.Namespace) -> None:
     from sb3_uspl.film import film
 
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
-    with contextlib.closing(make_for_pictures(arguments.env, _env_kwargs(arguments))) as env:
+    with contextlib.closing(make_for_pictures(arguments.env, kwargs)) as env:
         film({arguments.algo: model}, env, seeds, arguments.film, uncertainty, arguments.policy)
     print(arguments.film)
 
@@ -91,13 +103,13 @@ def write_replay_page(model: BaseAlgorithm, venv: VecEnv, arguments: argparse.Na
 
     :param model: the agent
     :param venv: its environments, only asked for what they are wrapped in
-    :param arguments: with ``env``, ``algo``, ``physics``, ``seed`` and ``replay``
+    :param arguments: with ``env``, ``env_kwargs``, ``algo``, ``physics``, ``seed`` and ``replay``
     :raises ValueError: if it cannot be shown
     """
     from sb3_uspl.replay import write_replay
 
     _check_plain(venv)
-    with contextlib.closing(gym.make(arguments.env, **_env_kwargs(arguments))) as env:
+    with contextlib.closing(gym.make(arguments.env, **env_kwargs(arguments))) as env:
         title = f"{arguments.env}: {arguments.algo}, deployment policy, seed {arguments.seed}"
         write_replay(model, env, arguments.seed, arguments.replay, title)
 
@@ -107,8 +119,12 @@ def _check_plain(venv: VecEnv) -> None:
         raise ValueError("The agent was trained under VecNormalize; films and replays run in the plain environment.")
 
 
-def _env_kwargs(arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"physics": arguments.physics} if arguments.physics else {}
+def env_kwargs(arguments: argparse.Namespace) -> dict[str, Any]:
+    """
+    :param arguments: with ``env_kwargs`` and ``physics``
+    :return: arguments of the environment
+    """
+    return {**arguments.env_kwargs, **({"physics": arguments.physics} if arguments.physics else {})}
 
 
 def make_for_pictures(env_id: str, kwargs: dict[str, Any]) -> gym.Env:

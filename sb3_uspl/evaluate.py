@@ -70,7 +70,7 @@ def load_agent(
         venv.close()
         raise ValueError(
             f"{model_path} was trained on other spaces than those of {env_id}: {error}. Choose the environment, and the "
-            "env_kwargs, that it was trained with."
+            "--env-kwargs, that it was trained with."
         ) from error
     return model, venv
 
@@ -90,6 +90,7 @@ def parse_arguments() -> argparse.Namespace:
         choices=("kinematic", "compiled", "varied", "full", "full_accurate"),
         help="fidelity of the robot; default: the environment's",
     )
+    _episode.add_env_kwargs(parser)
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="seed of the first episode")
     parser.add_argument("--n-envs", type=int, default=32, help="environments that run at the same time")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, for environments of your own")
@@ -121,7 +122,7 @@ def main() -> None:
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    env_kwargs = {"physics": arguments.physics} if arguments.physics else None
+    env_kwargs = _episode.env_kwargs(arguments)
     n_envs = min(arguments.n_envs, arguments.episodes)
     model, venv = load_agent(
         arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs, env_kwargs

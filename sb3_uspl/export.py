@@ -18,7 +18,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, is_vecenv_wrapped, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 import sb3_uspl
 from sb3_uspl.deployment import NEXT, DeploymentPolicy, Signal
@@ -155,6 +155,7 @@ def _bound(limits: np.ndarray) -> Any:
 
 def parse_arguments() -> argparse.Namespace:
     """:return: command line"""
+    from sb3_uspl._episode import add_env_kwargs
     from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS
 
     parser = argparse.ArgumentParser(prog="python -m sb3_uspl.export", description=__doc__)
@@ -166,6 +167,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--exp-id", type=int, default=0, help="experiment number; default: the latest")
     parser.add_argument("--load-best", action="store_true", help="best model of the training's evaluations")
     parser.add_argument("--horizon", type=int, help="decisions that a Transformer remembers; default: the longest episode")
+    add_env_kwargs(parser)
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, for environments of your own")
     parser.add_argument("-o", "--out", required=True, type=Path, help="file to write; its card lies beside it")
     return parser.parse_args()
@@ -187,16 +189,13 @@ def _export(arguments: argparse.Namespace) -> dict[str, Any]:
     from sb3_uspl.evaluate import load_agent
 
     register(arguments.gym_packages)
-    model, venv = load_agent(
-        arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, 1, path=arguments.path
-    )
+    kwargs, chosen = arguments.env_kwargs, (arguments.exp_id, arguments.load_best)
+    model, venv = load_agent(arguments.algo, arguments.env, arguments.folder, *chosen, 1, kwargs, arguments.path)
     try:
-        if is_vecenv_wrapped(venv, VecFrameStack):
-            raise ValueError("The agent was trained with frame_stack, which is not exported: its memory does without.")
         normalize = unwrap_vec_normalize(venv)
     finally:
         venv.close()
-    with contextlib.closing(gym.make(arguments.env)) as env:
+    with contextlib.closing(gym.make(arguments.env, **kwargs)) as env:
         world: Any = env.unwrapped
         period = getattr(world, "decision_period", None)
         steps = env.spec.max_episode_steps if env.spec is not None else None

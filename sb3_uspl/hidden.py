@@ -75,6 +75,8 @@ class HiddenParameters(gym.Wrapper):
                 key for key, value in vars(self.env.unwrapped).items() if isinstance(value, int | float) and key[0] != "_"
             )
             raise ValueError(f"{self.env.unwrapped} has no attribute '{name}'; its numbers are {known}.")
+        if not isinstance(values, tuple | list):
+            raise ValueError(f"'{name}': {values!r}; expected a range (low, high) or a list of two or more values.")
         if isinstance(values, tuple):
             is_possible = len(values) == 2 and values[0] < values[1]
         else:

@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
 COMMON, TARGET, PRIVILEGED = "common", "target", "privileged"
 TRUTH, UNCERTAINTY, BELIEF = "truth", "uncertainty", "belief"
@@ -73,16 +73,22 @@ def check_observation_space(space: spaces.Space) -> spaces.Dict:
     return space
 
 
-def check_normalization(venv: VecEnv) -> None:
+def check_vec_wrappers(venv: VecEnv) -> None:
     """
-    Refuse what ``VecNormalize`` must leave as it is: the privileged observation, in whose units and bounds blurring, reward
-    transformation and the encoder's uncertainty are, and images, which would arrive on another scale than the encoder assumes.
+    Refuse ``VecFrameStack``, which would stack the privileged observation, too, and what ``VecNormalize`` must leave as it is:
+    the privileged observation, in whose units and bounds blurring, reward transformation and the encoder's uncertainty are,
+    and images, which would arrive on another scale than the encoder assumes.
 
     The space of uint8 images changes when they are normalised, that of float16 images and of ``privileged`` does not.
 
     :param venv: environments under the observation contract
     :raises ValueError: naming the remedy
     """
+    if is_vecenv_wrapped(venv, VecFrameStack):
+        raise ValueError(
+            "VecFrameStack stacks the privileged observation, too. Leave it out (in a zoo file: frame_stack); the encoder "
+            "remembers all observations of the episode."
+        )
     normalize = unwrap_vec_normalize(venv)
     space = venv.observation_space
     if normalize is None or not normalize.norm_obs or not isinstance(space, spaces.Dict):
@@ -151,7 +157,8 @@ class PrivilegedObservation(gym.ObservationWrapper):
     :param target: indices or keys that only the encoder sees (optional); one key may be an image
     :param scale: factor on the privileged part, a number or one per dimension
     :param offset: subtracted from the privileged part before scaling
-    :raises ValueError: if an index or key does not exist, is named twice or nothing is left as common observation
+    :raises ValueError: if an index or key does not exist, is named twice or nothing is left as common observation, or if there
+        are not as many scales or offsets as privileged values
     """
 
     def __init__(
@@ -163,6 +170,10 @@ class PrivilegedObservation(gym.ObservationWrapper):
         offset: float | Sequence[float] = 0.0,
     ):
         super().__init__(env)
+        for name, names in (("privileged", privileged), ("target", target)):
+            if isinstance(names, str) or not np.iterable(names):
+                raise ValueError(f"{name}={names!r}: give a list of indices or keys, e.g. [{names!r}].")
+        hidden, only_encoder = list[Any](privileged), list[Any](target)
         space = env.observation_space
         if isinstance(space, spaces.Box) and len(space.shape) == 1:
             available: list[Any] = list(range(space.shape[0]))
@@ -170,21 +181,27 @@ class PrivilegedObservation(gym.ObservationWrapper):
             available = list(space.spaces)
         else:
             raise ValueError(f"PrivilegedObservation takes a one-dimensional Box or a flat Dict of boxes, not {space}.")
-        named = [*privileged, *target]
+        named = [*hidden, *only_encoder]
         unknown = [name for name in named if name not in available]
-        if unknown or len(set(named)) != len(named) or not privileged:
+        if unknown or len(set(named)) != len(named) or not hidden:
             raise ValueError(
-                f"privileged={list(privileged)}, target={list(target)}: name at least one privileged part, and each "
+                f"privileged={hidden}, target={only_encoder}: name at least one privileged part, and each "
                 f"part once, out of {available}."
             )
         common = [name for name in available if name not in named]
         if not common:
             raise ValueError("Every part of the observation is privileged or target; at least one must stay common.")
-        self._parts: dict[str, list[Any]] = {COMMON: common, PRIVILEGED: list(privileged)}
-        if target:
-            self._parts[TARGET] = list(target)
+        self._parts: dict[str, list[Any]] = {COMMON: common, PRIVILEGED: hidden}
+        if only_encoder:
+            self._parts[TARGET] = only_encoder
         self._scale = np.asarray(scale, dtype=np.float32)
         self._offset = np.asarray(offset, dtype=np.float32)
+        n_privileged = len(self._ends(PRIVILEGED)[0])
+        for name, values in (("scale", self._scale), ("offset", self._offset)):
+            if values.shape not in ((), (n_privileged,)):
+                raise ValueError(
+                    f"{name}={values.tolist()}: give one number, or one for each of the {n_privileged} privileged ones."
+                )
         self.observation_space = spaces.Dict({key: self._part_space(key) for key in self._parts})
         check_observation_space(self.observation_space)
 
@@ -206,18 +223,23 @@ class PrivilegedObservation(gym.ObservationWrapper):
             return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts])
         return np.asarray(observation, dtype=np.float32)[names]
 
-    def _part_space(self, key: str) -> spaces.Box:
+    def _ends(self, key: str) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest values of a part, as they are in the wrapped environment."""
         names, space = self._parts[key], self.env.observation_space
         if isinstance(space, spaces.Dict):
             boxes = [space[name] for name in names]
-            if len(boxes) == 1 and key != PRIVILEGED:
-                assert isinstance(boxes[0], spaces.Box)
-                return boxes[0]
-            low = np.concatenate([box.low for box in boxes])  # type: ignore[attr-defined]
-            high = np.concatenate([box.high for box in boxes])  # type: ignore[attr-defined]
-        else:
-            assert isinstance(space, spaces.Box)
-            low, high = space.low[names], space.high[names]
+            low, high = ([getattr(box, end) for box in boxes] for end in ("low", "high"))
+            return np.concatenate(low), np.concatenate(high)
+        assert isinstance(space, spaces.Box)
+        return space.low[names], space.high[names]
+
+    def _part_space(self, key: str) -> spaces.Box:
+        names, space = self._parts[key], self.env.observation_space
+        if isinstance(space, spaces.Dict) and len(names) == 1 and key != PRIVILEGED:
+            box = space[names[0]]
+            assert isinstance(box, spaces.Box)
+            return box
+        low, high = self._ends(key)
         if key == PRIVILEGED:
             ends = np.stack([(low - self._offset) * self._scale, (high - self._offset) * self._scale])
             low, high = ends.min(axis=0), ends.max(axis=0)

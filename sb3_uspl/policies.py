@@ -198,7 +198,7 @@ class USPLPolicy(ContractPolicy):
     @staticmethod
     def _only_policy_keys(obs: PyTorchObs) -> PyTorchObs:
         assert isinstance(obs, dict)
-        return {key: obs[key] for key in POLICY_KEYS}
+        return {key: obs[key] for key in POLICY_KEYS if key in obs}
 
     def _begin_with(self, action: Sequence[float]) -> None:
         """Choose the bias of an untrained actor so that its mean action is the given one."""

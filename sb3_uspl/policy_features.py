@@ -62,7 +62,15 @@ class PolicyFeatures(BaseFeaturesExtractor):
         """
         :param obs: batch by key, ``(n, ...)``
         :return: ``(n, features_dim)``
+        :raises ValueError: if a part is missing
         """
+        wanted = [COMMON, self.privileged_key] + [UNCERTAINTY] * self.uncertainty_input + [BELIEF] * self.mean_input
+        missing = [key for key in wanted if key not in obs]
+        if missing:
+            raise ValueError(
+                f"There is no {missing} in the observation {sorted(obs)}. Actor and critic see what experience is made into, "
+                f"{wanted}; `predict` takes the environment's own observations."
+            )
         obs = self._canonical(obs)
         parts = [self.common_normalizer(obs[COMMON]), self._seen(obs[self.privileged_key])]
         if self.uncertainty_input:

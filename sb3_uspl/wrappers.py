@@ -24,7 +24,7 @@ from sb3_uspl.observations import (
     TRUTH,
     UNCERTAINTY,
     check_finite,
-    check_normalization,
+    check_vec_wrappers,
 )
 from sb3_uspl.uncertainty import (
     C_MAX,
@@ -180,7 +180,7 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, encoder: ObservationEncoder, config: UncertaintyConfig, seed: int | None = None):
-        check_normalization(venv)
+        check_vec_wrappers(venv)
         super().__init__(venv)
         self.encoder, self.config = encoder, config
         self.progress = 0.0

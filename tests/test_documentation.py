@@ -35,7 +35,7 @@ for line in sys.argv[1:]:
         if end.code:
             raise
 """
-PREAMBLE = "import gymnasium, gymnasium as gym, bullet_tasks, my_module\n"
+PREAMBLE = "import my_module\n"
 MY_MODULE = """
 import gymnasium as gym
 import numpy as np

@@ -104,7 +104,7 @@ class RESeLPolicy(ContractPolicy):
         # ActorCriticPolicy takes it that actor and critic have features of one width.
         n_inputs = self.vf_features_extractor.features_dim
         critic = MlpExtractor(n_inputs, self.net_arch, self.activation_fn, self.device)
-        self.mlp_extractor.value_net = critic.value_net
+        self.mlp_extractor.value_net, self.mlp_extractor.latent_dim_vf = critic.value_net, critic.latent_dim_vf
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -114,7 +114,7 @@ class RESeLPolicy(ContractPolicy):
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         assert isinstance(obs, dict)
-        return super().forward({key: obs[key] for key in (COMMON, PRIVILEGED, EMBEDDING)}, deterministic)  # type: ignore[arg-type]
+        return super().forward({key: obs[key] for key in (COMMON, PRIVILEGED, EMBEDDING) if key in obs}, deterministic)  # type: ignore[arg-type]
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
         assert isinstance(obs, dict)

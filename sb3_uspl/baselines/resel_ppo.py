@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_uspl._arguments import check_action_std
 from sb3_uspl.baselines.resel_policy import RESeLPolicy
 from sb3_uspl.baselines.sequences import HistoryVecWrapper, SequenceRolloutBuffer
-from sb3_uspl.observations import check_normalization, check_observation_space
+from sb3_uspl.observations import check_observation_space, check_vec_wrappers
 from sb3_uspl.schedules import CosineSchedule, falling
 
 SelfRESeLPPO = TypeVar("SelfRESeLPPO", bound="RESeLPPO")
@@ -120,7 +120,7 @@ class RESeLPPO(PPO):
     def _check_arguments(self) -> None:
         check_observation_space(self.observation_space)
         if self.env is not None:
-            check_normalization(self.env)
+            check_vec_wrappers(self.env)
         if not issubclass(self.policy_class, RESeLPolicy):
             raise ValueError(f"RESeLPPO needs a subclass of RESeLPolicy as policy; {self.policy_class} was given.")
         if not issubclass(self.rollout_buffer_class or SequenceRolloutBuffer, SequenceRolloutBuffer):
@@ -132,18 +132,19 @@ class RESeLPPO(PPO):
             )
         if self.context_length < 1:
             raise ValueError(f"context_length={self.context_length}: an episode has one decision at least.")
-        check_action_std(self.action_std, self.action_space)
+        check_action_std(self.action_std, self.action_space, self.policy_kwargs)
 
     def learn(
         self: SelfRESeLPPO,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
-        tb_log_name: str = "RESeLPPO",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfRESeLPPO:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(
         self,

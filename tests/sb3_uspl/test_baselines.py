@@ -9,8 +9,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_uspl import RMA, USPLPPO, PrivRecons, RewReg
+from sb3_uspl import RMA, USPLPPO, PrivRecons, RESeLPPO, RewReg
 from sb3_uspl.baselines.rewreg import MAX_KL
 from sb3_uspl.observations import HidePrivileged
 from sb3_uspl.wrappers import UncertaintyVecWrapper
@@ -36,6 +38,40 @@ def parameters(model):
 
 
 # -- the contract that all share ---------------------------------------------------------------------------------------------
+
+
+OURS = (*ALGORITHMS, RESeLPPO)
+ANY = dict(n_steps=16, batch_size=32, n_epochs=2, seed=0)
+
+
+@pytest.mark.parametrize("algorithm", OURS)
+def test_tensorboard_tells_the_algorithms_apart(algorithm, tmp_path):
+    model = algorithm("MlpPolicy", make_vec_env(ToyEnv, 8), tensorboard_log=str(tmp_path), **ANY)
+    model.learn(128)
+    model.learn(128, tb_log_name="mine")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([f"{algorithm.__name__}_1", "mine_1"])
+
+
+@pytest.mark.parametrize("algorithm", (USPLPPO, RESeLPPO))
+def test_what_would_be_ignored_or_misunderstood_is_refused(algorithm):
+    venv = make_vec_env(ToyEnv, 8)
+    with pytest.raises(ValueError, match="VecFrameStack stacks the privileged observation"):
+        algorithm("MlpPolicy", VecFrameStack(venv, 3), **ANY)
+    with pytest.raises(ValueError, match="action_std=None to have it learned from log_std_init"):
+        algorithm("MlpPolicy", venv, policy_kwargs=dict(log_std_init=-2.0), **ANY)
+    learned = algorithm("MlpPolicy", venv, policy_kwargs=dict(log_std_init=-2.0), action_std=None, **ANY)
+    assert float(learned.policy.log_std.detach().mean()) == -2.0
+    with pytest.raises(ValueError, match=r"experience is made into.*`predict`"):
+        learned.policy.get_distribution(obs_as_tensor(venv.reset(), learned.device))
+    with pytest.raises(ValueError, match=r"experience is made into.*`predict`"):
+        learned.policy(obs_as_tensor(venv.reset(), learned.device))
+
+
+@pytest.mark.parametrize("algorithm", (USPLPPO, RESeLPPO))
+@pytest.mark.parametrize("net_arch", ([], dict(pi=[16], vf=[]), dict(pi=[], vf=[8, 4])))
+def test_actor_and_critic_may_have_any_layers(algorithm, net_arch):
+    model = algorithm("MlpPolicy", make_vec_env(ToyEnv, 8), policy_kwargs=dict(net_arch=net_arch), **ANY)
+    model.learn(128)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -101,6 +101,14 @@ def test_enjoy_writes_a_replay_and_runs_without_a_window(logs, tmp_path):
     assert result.returncode == 0 and "Success rate" in result.stdout, result.stderr
 
 
+def test_evaluation_and_export_take_arguments_of_the_environment(tmp_path):
+    where = ("--env", "ActiveTMaze-v0", "--env-kwargs", "corridor_length:5")
+    result = run("sb3_uspl.evaluate", *where, "--episodes", "4", "--policy", "deployment", "--json")
+    assert result.returncode == 0 and json.loads(result.stdout)["mean_length"] == 5 + 3, result.stderr
+    result = run("sb3_uspl.export", *where, "--format", "torchscript", "-o", str(tmp_path / "out"))
+    assert result.returncode == 0 and (tmp_path / "out.pt").is_file(), result.stderr
+
+
 def test_evaluation_shows_its_first_episode(logs, tmp_path):
     pytest.importorskip("plotly")
     where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(logs), "--episodes", "1", "--json")

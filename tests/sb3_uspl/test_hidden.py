@@ -99,7 +99,7 @@ def test_bad_parameters_are_refused():
     make = gym.make
     with pytest.raises(ValueError, match=r"no attribute 'mass'; its numbers are .*'m'"):
         HiddenParameters(make("Pendulum-v1"), {"mass": (0.5, 2.0)})
-    for values in ((2.0, 0.5), [1.0], [1.0, 1.0], (1.0, 2.0, 3.0), (0.0, np.inf)):
+    for values in ((2.0, 0.5), [1.0], [1.0, 1.0], (1.0, 2.0, 3.0), (0.0, np.inf), 5.0):
         with pytest.raises(ValueError, match=r"'m': .*expected a range"):
             HiddenParameters(make("Pendulum-v1"), {"m": values})
     with pytest.raises(ValueError, match="at least one"):

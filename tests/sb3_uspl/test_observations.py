@@ -102,3 +102,23 @@ def test_keys_are_concatenated_and_images_pass_through():
 def test_impossible_parts_are_refused(kwargs):
     with pytest.raises(ValueError, match=r"name at least one|must stay common"):
         PrivilegedObservation(FlatEnv(), **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        (dict(privileged=[2], scale=[0.1, 0.2]), r"scale=.*one for each of the 1 privileged"),
+        (dict(privileged=[1, 2], offset=[0.0, 1.0, 2.0]), r"offset=.*one for each of the 2 privileged"),
+        (dict(privileged=2), r"privileged=2: give a list"),
+        (dict(privileged="goal"), r"give a list .*\['goal'\]"),
+        (dict(privileged=[1], target=3), r"target=3: give a list"),
+    ],
+)
+def test_numbers_that_do_not_fit_the_parts_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        PrivilegedObservation(FlatEnv(), **kwargs)
+
+
+def test_indices_may_be_an_array():
+    env = PrivilegedObservation(FlatEnv(), privileged=np.array([1, 2]), scale=[1.0, 2.0])
+    assert env.observation_space["privileged"].shape == (2,)
