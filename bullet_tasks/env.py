@@ -203,7 +203,7 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 class TaskTimeLimit(TimeLimit):
     """
     Truncates an episode when the time is up that the task's configuration gives it, or after the ``max_episode_steps`` that
-    ``gymnasium.make`` was given.
+    ``gymnasium.make`` was given; -1 there does not lift the limit, a great number or ``env.unwrapped`` does.
 
     :param env: a ``RobotTaskEnv``, within ``TimeLimit`` if ``max_episode_steps`` was given
     """

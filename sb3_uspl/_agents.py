@@ -76,7 +76,7 @@ def why_not_loaded(algo: str, path: str, error: Exception) -> str:
 
 def check_agent() -> None:
     """End with a message, rather than with the zoo's traceback, if the agent on the command line is missing or unreadable."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="ppo")
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-f", "--folder", default=_HUB)

@@ -176,7 +176,9 @@ def check_action_std(
     n_action = get_flattened_obs_dim(action_space)
     stds = np.asarray(action_std, dtype=float)
     if stds.shape not in ((), (n_action,)) or not (np.isfinite(stds) & (stds > 0.0)).all():
-        raise ValueError(f"action_std={action_std}: give one positive number, or one for each of the {n_action} of an action.")
+        raise ValueError(
+            f"action_std={action_std}: give one positive number, or one for each of the {n_action} action values."
+        )
 
 
 def in_decisions(name: str, times: tuple[float, float], decision_period: float) -> tuple[float, float]:

@@ -37,6 +37,7 @@ _LINE: Colour = (0.62, 0.64, 0.68, 1.0)
 _POST: Colour = (0.42, 0.50, 0.60, 1.0)
 _BAND: Colour = (0.20, 0.72, 0.38, 1.0)
 _FLOOR_PER_TIME = 70.0 / (12.0 * math.tan(0.5))  # m/s for a tilt of 45 degrees; further than it drifts
+_GREATEST_TILT = 1.4  # rad; near a right angle nothing flies far
 _FLOOR_HALF_HEIGHT = 0.05  # m
 _LINE_DISTANCE, _N_LINES = 2.0, 6  # m; lines on either side of the middle one
 _POST_DISTANCE, _N_POSTS = 4.0, 3
@@ -213,7 +214,7 @@ class BiasedQuadrotor(Task):
         """A floor with lines, and posts with a band at the altitude of the hover: without them nothing shows a drift."""
         c, hover = self.config, self.config.hover
         # A body tilted further than by `flip_tilt` has turned over.
-        tilt = min(c.angle_range + c.angle_bias, hover.flip_tilt)
+        tilt = min(c.angle_range + c.angle_bias, hover.flip_tilt, _GREATEST_TILT)
         half_size = _FLOOR_PER_TIME * c.time_limit * math.tan(tilt)
         shapes: list[Shape] = [
             Box(

@@ -1,6 +1,5 @@
 """Where a number comes from: commit and machine."""
 
-import functools
 import os
 import platform
 import subprocess
@@ -12,7 +11,6 @@ import torch as th
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@functools.cache
 def commit() -> str | None:
     """:return: commit of the code, with "+changes" if the working tree differs from it; None outside of a checkout"""
     head = _git("rev-parse", "HEAD")

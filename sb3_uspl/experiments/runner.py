@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 from sb3_uspl.experiments.plan import Cell
+from sb3_uspl.experiments.provenance import commit
 from sb3_uspl.experiments.results import Results
 from sb3_uspl.experiments.store import CHECKPOINTS_PER_TRAINING, CellFolder
 
@@ -60,6 +61,8 @@ class Job:
     begin: float
     first: int
     """Decisions at the start of this attempt."""
+    commit: str | None
+    """Of the code when it was started; somebody may go on working while a long grid runs."""
 
 
 class Grid:
@@ -157,7 +160,7 @@ class Grid:
         log.write(f"\n== python -m {' '.join(arguments)}\n")
         log.flush()
         begin = time.monotonic()
-        self.running.append(Job(folder, phase, self.start(arguments, log), log, begin, first))
+        self.running.append(Job(folder, phase, self.start(arguments, log), log, begin, first, commit()))
 
     def _end(self, job: Job) -> None:
         self.running.remove(job)
@@ -175,7 +178,7 @@ class Grid:
         # The zoo ends an interrupted training without an error.
         trained = status == 0 and folder.decisions() >= cell.timesteps
         self._trained.append((cell, time.monotonic() - job.begin, max(folder.decisions() - job.first, 0)))
-        folder.add_attempt(time.monotonic() - job.begin, self.jobs, trained)
+        folder.add_attempt(time.monotonic() - job.begin, self.jobs, trained, job.commit)
         if trained:
             self._measure(folder)
         elif job.first and folder.decisions() <= job.first:
@@ -203,7 +206,7 @@ class Grid:
                 job.child.wait()
             job.log.close()
             if job.phase == "train":
-                job.folder.add_attempt(time.monotonic() - job.begin, self.jobs, trained=False)
+                job.folder.add_attempt(time.monotonic() - job.begin, self.jobs, False, job.commit)
         self.running = []
 
     # -- progress ----------------------------------------------------------------------------------------------------------

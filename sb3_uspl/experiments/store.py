@@ -13,7 +13,6 @@ import numpy as np
 import yaml
 
 from sb3_uspl.experiments.plan import Cell
-from sb3_uspl.experiments.provenance import commit
 
 CHECKPOINT = "rl_model_*_steps.zip"
 CHECKPOINTS_PER_TRAINING = 20
@@ -73,16 +72,17 @@ class CellFolder:
             return {"wall_times": [], "jobs": [], "commits": [], "trained": False}
         return {"commits": [], **json.loads(self._state.read_text())}
 
-    def add_attempt(self, wall_time: float, jobs: int, trained: bool) -> None:
+    def add_attempt(self, wall_time: float, jobs: int, trained: bool, commit: str | None) -> None:
         """
         :param wall_time: s
         :param jobs: trainings that ran at the same time
         :param trained: whether the training reached its end
+        :param commit: of its code
         """
         state = self.state
         state["wall_times"].append(wall_time)
         state["jobs"].append(jobs)
-        state["commits"].append(commit())
+        state["commits"].append(commit)
         state["trained"] = trained
         self._state.write_text(json.dumps(state))
 

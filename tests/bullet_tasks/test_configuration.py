@@ -108,6 +108,11 @@ def test_a_configured_time_is_the_episodes_length_unless_steps_are_given(env_id,
         assert length(gymnasium.make(env_id, physics="compiled", config=config, max_episode_steps=given)) == given
 
 
+def test_a_quadrotor_may_tilt_as_far_as_it_likes():
+    config = {"hover": {"flip_tilt": 2.0}, "angle_range": 1.8}
+    assert gymnasium.make("BiasedQuadrotor-v0", config=config).unwrapped.scene["floor"].half_extents[0] > 300.0
+
+
 def test_a_long_flight_stays_above_the_floor():
     env = gymnasium.make("BiasedQuadrotor-v0", config={"time_limit": 24.0})
     env.reset(seed=0)

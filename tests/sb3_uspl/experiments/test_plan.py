@@ -92,12 +92,15 @@ REFERENCES = ("resel_ppo", "recurrent_ppo", "frame_stacked_ppo")
 @pytest.mark.parametrize("name", REFERENCES)
 def test_those_without_a_privileged_policy_share_uspls_experience_and_discount(plan, name):
     shared = ("env_kwargs", "n_steps", "n_epochs", "gamma", "gae_lambda", "learning_rate", "ent_coef", "n_timesteps")
-    for env in plan.experiments["table1"].envs + plan.experiments["table9"].envs:
+    for env in [env for name in ("table1", "table9", "figure5") for env in plan.experiments[name].envs]:
         ours, uspl = (plan.cell(each, env, 1, plan.budgets["cpu"]).hyperparameters for each in (name, "uspl"))
-        if name == "resel_ppo" and env == "SignpostNav-v0":
+        if name == "resel_ppo" and env.startswith("SignpostNav"):
             ours = {**ours, "env_kwargs": {**ours["env_kwargs"], "max_episode_steps": 240}}  # episodes of its own
-        for key in shared if name != "resel_ppo" else (*shared, "n_envs", "action_std", "action_std_floor"):
+        for key in shared if name != "resel_ppo" else (*shared, "action_std", "action_std_floor"):
             assert ours.get(key) == uspl.get(key), (env, key)
+        paper = [plan.cell(each, env, 1, plan.budgets["paper"]).hyperparameters for each in (name, "uspl")]
+        for key in ("action_std", "action_std_floor", "learning_rate_floor") if name == "resel_ppo" else ():
+            assert paper[0][key] == paper[1][key], (env, key)
 
 
 def test_the_sweep_of_table_11_is_the_papers(plan):

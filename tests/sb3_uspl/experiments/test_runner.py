@@ -230,7 +230,7 @@ def test_the_time_left_counts_every_cell_at_its_own_speed(tmp_path):
     # What has been trained already needs to be measured only; what has a checkpoint, the rest.
     folder = CellFolder(tmp_path / "logs", slow)
     folder.create()
-    folder.add_attempt(1.0, 1, trained=True)
+    folder.add_attempt(1.0, 1, True, "c0ffee")
     again = Grid([slow], tmp_path / "logs", Results(tmp_path / "raw"), 1, FakeMachine())
     again._measuring_times = [2.0]
     assert again._seconds_left([], {}) == 2.0
