@@ -131,7 +131,7 @@ def train(algorithm, scale=0.25, rewards=None, **arguments):
         gamma=0.9,
         encoder_updates=8,
         encoder_batch_size=512,
-        policy_kwargs=dict(encoder_kwargs=dict(hidden=(32,), trunk=(32,), embedding=(32,))),
+        policy_kwargs=dict(encoder_kwargs=dict(hidden=(32,), trunk=(32,), embedding=(32,), leak=1.0)),
         seed=1,
         **arguments,
     )

@@ -57,10 +57,13 @@ class RecoverableTanh(nn.Module):
     with legs" in ``docs/full_physics.md``.
 
     :param leak: least slope towards zero, in [0, 1]
+    :raises ValueError: for any other
     """
 
     def __init__(self, leak: float = LEAK) -> None:
         super().__init__()
+        if not 0.0 <= leak <= 1.0:
+            raise ValueError(f"leak={leak}: the least slope of a tanh towards zero is a number in [0, 1].")
         self.leak = leak
 
     def forward(self, x: th.Tensor) -> th.Tensor:

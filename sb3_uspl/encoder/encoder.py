@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from sb3_uspl.activations import RecoverableTanh
+from sb3_uspl.activations import LEAK, RecoverableTanh
 from sb3_uspl.encoder.features import TokenFeatures, Tokens, mlp
 from sb3_uspl.encoder.memory import MEMORIES, MemoryState
 from sb3_uspl.observations import PRIVILEGED, TARGET, is_image
@@ -23,6 +23,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         image_layers=(64,),
         trunk=(128,),
         embedding=(128,),
+        leak=LEAK,
         head=(),
         frequencies=4,
         fourier_inputs=None,
@@ -41,6 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         image_layers=(128, 128),
         trunk=(1024, 512, 256),
         embedding=(256, 128),
+        leak=LEAK,
         head=(512, 256),
         frequencies=0,
         fourier_inputs=None,
@@ -55,7 +57,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 """
 Sizes of the encoder: ``hidden`` layers for the common observation and for a vector target, ``hidden_beside_image`` for the
 common observation if the target is an image (None: ``hidden``), the image's ``convolutions`` and ``image_layers`` (see
-``ImageCNN``), the ``trunk`` before the memory, the ``embedding`` after it, the ``head`` of mean and standard deviation,
+``ImageCNN``), the ``trunk`` before the memory, the ``embedding`` after it and the ``leak`` of its tanh (see
+``RecoverableTanh``), the ``head`` of mean and standard deviation,
 ``frequencies`` of the Fourier features and ``fourier_inputs`` that have them, whether to ``normalize`` the common observation,
 ``extremes`` of a vector target and the ``scan`` of an image as inputs (all see ``TokenFeatures``), whether linear layers start
 ``orthogonal`` (gain sqrt(2), no bias) instead of in torch's way, which halves the signal in each, whether the belief about
@@ -218,7 +221,9 @@ class ObservationEncoder(nn.Module):
         self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
         self.embedding = mlp(self.memory.width, sizes["embedding"])
         if sizes["embedding"]:
-            self.embedding[-1] = RecoverableTanh()  # "the final embedding is activated using the Tanh function" (C.3.3)
+            self.embedding[-1] = RecoverableTanh(
+                sizes["leak"]
+            )  # "the final embedding is activated using the Tanh function" (C.3.3)
         width = sizes["embedding"][-1] if sizes["embedding"] else self.memory.width
         self.mean = self._head(width, sizes["head"], n_privileged)
         self.log_std = self._head(width, sizes["head"], n_privileged)

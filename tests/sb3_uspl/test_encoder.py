@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
+from sb3_uspl.activations import RecoverableTanh
 from sb3_uspl.encoder import (
     MAX_STD,
     MEMORIES,
@@ -342,3 +343,11 @@ def test_either_memory_learns_what_was_revealed_and_says_when(memory):
         optimizer.step()
     std = encoder(tokens, lengths)[0].std.view(256, 8).mean(0)
     assert std[:2].min() > 3 * std[3:].max()
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.3, 1.0])
+def test_the_embeddings_leak_is_ones_choice(leak):
+    encoder = ObservationEncoder(ToyEnv().observation_space, 1, overrides=dict(leak=leak))
+    assert [part.leak for part in encoder.modules() if isinstance(part, RecoverableTanh)] == [leak]
+    with pytest.raises(ValueError, match=r"leak=2.0.*\[0, 1\]"):
+        ObservationEncoder(ToyEnv().observation_space, 1, overrides=dict(leak=2.0))
