@@ -118,7 +118,7 @@ class RESeLPolicy(ContractPolicy):
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
         assert isinstance(obs, dict)
-        return super().predict_values({key: obs[key] for key in (COMMON, PRIVILEGED)})
+        return super().predict_values({key: obs[key] for key in (COMMON, PRIVILEGED) if key in obs})
 
     def evaluate_actions(  # type: ignore[override]
         self, obs: SequenceBatch, actions: th.Tensor
