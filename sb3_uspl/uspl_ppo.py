@@ -64,7 +64,7 @@ class USPLPPO(PPO):
     :param learning_rate_floor: share of the learning rate left at the end of training (release: 1/20)
     :param action_std: initial standard deviation of continuous actions, of all or of each, annealed by a cosine, not learned
         (Table 4: 0.35; Table 5: 0.65). None learns it, as stock PPO does.
-    :param action_std_floor: share of ``action_std`` left at the end of training (release: 1/5)
+    :param action_std_floor: share of ``action_std`` left at the end of training (release: 1/5; see ``docs/findings.md``)
     :param action_noise_time: time constant in s over which the noise of continuous actions is correlated during the warm-up,
         so that it finds detours; 0: not at all
     :param action_noise_timesteps: decisions after the warm-up over which that time constant falls to 0 along a cosine. PPO
@@ -161,7 +161,7 @@ class USPLPPO(PPO):
         target_kl: float | None = None,
         learning_rate_floor: float = 0.05,
         action_std: float | Sequence[float] | None = 0.35,
-        action_std_floor: float = 0.2,
+        action_std_floor: float = 0.5,
         action_noise_time: float = 0.0,
         action_noise_timesteps: int = 500_000,
         warmup_timesteps: int | None = None,

@@ -69,7 +69,7 @@ class RESeLPPO(PPO):
         target_kl: float | None = 0.067,
         learning_rate_floor: float = 0.05,
         action_std: float | Sequence[float] | None = 0.35,
-        action_std_floor: float = 0.2,
+        action_std_floor: float = 0.5,
         encoder_learning_rate: float | Schedule = 5e-5,
         context_length: int = 1024,
         _init_setup_model: bool = True,
