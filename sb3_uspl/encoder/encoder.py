@@ -221,9 +221,8 @@ class ObservationEncoder(nn.Module):
         self.memory = MEMORIES[memory](self.features.width, **sizes["memory_kwargs"].get(memory, {}))
         self.embedding = mlp(self.memory.width, sizes["embedding"])
         if sizes["embedding"]:
-            self.embedding[-1] = RecoverableTanh(
-                sizes["leak"]
-            )  # "the final embedding is activated using the Tanh function" (C.3.3)
+            # "the final embedding is activated using the Tanh function" (C.3.3)
+            self.embedding[-1] = RecoverableTanh(sizes["leak"])
         width = sizes["embedding"][-1] if sizes["embedding"] else self.memory.width
         self.mean = self._head(width, sizes["head"], n_privileged)
         self.log_std = self._head(width, sizes["head"], n_privileged)
