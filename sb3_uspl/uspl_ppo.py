@@ -81,7 +81,7 @@ class USPLPPO(PPO):
     :param blur: privileged blurring, Eq. 3 and 4
     :param reward_scaling: reward transformation, Eq. 2
     :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)
-    :param mean_input: whether they also see the encoder's mean, as in the authors' release; needs ``uncertainty_input``
+    :param mean_input: whether they also see the encoder's mean, as in the authors' release. None: if they see the uncertainty
     :param c_min: C_min of Eq. 2
     :param c_max: C_max of Eq. 2
     :param delta: delta of Eq. 2 (Tables 4 and 5)
@@ -171,7 +171,7 @@ class USPLPPO(PPO):
         blur: bool = True,
         reward_scaling: bool = True,
         uncertainty_input: bool = True,
-        mean_input: bool = True,
+        mean_input: bool | None = None,
         c_min: float = C_MIN,
         c_max: float = C_MAX,
         delta: float = DELTA,
@@ -245,7 +245,8 @@ class USPLPPO(PPO):
         self.warmup_timesteps, self.ramp_timesteps = warmup_timesteps, ramp_timesteps
         self.policy_warmup, self.policy_restart = policy_warmup, policy_restart
         self.blur, self.reward_scaling = blur, reward_scaling
-        self.uncertainty_input, self.mean_input = uncertainty_input, mean_input and uncertainty_input
+        self.uncertainty_input = uncertainty_input
+        self.mean_input = uncertainty_input if mean_input is None else mean_input
         self.c_min, self.c_max, self.delta = c_min, c_max, delta
         self.blur_gain, self.blur_noise, self.blur_hold_time = blur_gain, blur_noise, blur_hold_time
         self.discrete_privileged = discrete_privileged

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_uspl import RMA, USPLPPO, MlpPolicy
 from sb3_uspl._threads import torch_threads
+from sb3_uspl.observations import BELIEF, UNCERTAINTY
 from tests.sb3_uspl.toy import ToyEnv
 
 FAST = dict(n_steps=16, batch_size=32, n_epochs=2, encoder_updates=2, encoder_batch_size=64, seed=0)
@@ -337,6 +338,25 @@ def test_success_of_the_privileged_policy_leaves_out_mismatched_environments():
     infos = [{"is_success": i < 6} for i in range(8)]
     model._update_info_buffer(infos, np.ones(8, dtype=bool))
     assert list(model.ep_success_buffer) == [True] * 6
+
+
+@pytest.mark.parametrize(
+    ("given", "seen"),
+    [
+        ({}, {UNCERTAINTY, BELIEF}),
+        (dict(mean_input=False), {UNCERTAINTY}),
+        (dict(uncertainty_input=False), set()),
+        (dict(uncertainty_input=False, mean_input=True), {BELIEF}),
+    ],
+    ids=["as the release", "no mean", "neither", "mean only"],
+)
+def test_what_actor_and_critic_see_of_the_belief_is_ones_choice(given, seen):
+    policy = make_model(**given).policy
+    obs = {key: th.full((1, *space.shape), 0.1) for key, space in policy.observation_space.spaces.items()}
+    for key in (UNCERTAINTY, BELIEF):
+        other = {**obs, key: obs[key] + 0.05}
+        assert th.equal(policy.predict_values(obs), policy.predict_values(other)) == (key not in seen)
+        assert th.equal(*(policy.get_distribution(o).mode() for o in (obs, other))) == (key not in seen)
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------------

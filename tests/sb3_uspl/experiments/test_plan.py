@@ -72,6 +72,7 @@ def test_an_ablation_changes_what_it_says_and_nothing_else(plan):
             ("without_blur", {"blur": False}),
             ("without_rew", {"reward_scaling": False}),
             ("without_ui", {"uncertainty_input": False}),
+            ("mean_not_ui", {"uncertainty_input": False, "mean_input": True}),
             ("only_ui", {"blur": False, "reward_scaling": False}),
             ("k_2.5", {"blur_gain": 2.5}),
         ):

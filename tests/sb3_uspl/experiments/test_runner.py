@@ -105,7 +105,7 @@ def test_a_finished_grid_is_never_repeated(tmp_path, cells):
     machine = FakeMachine()
     results, failed = run(tmp_path, cells, machine)
     assert not failed and all(results.has(cell) for cell in cells)
-    assert len(machine.trainings()) == len(cells) == 12 and len(machine.started) == 24
+    assert len(machine.trainings()) == len(cells) == 14 and len(machine.started) == 28
     again = FakeMachine()
     run(tmp_path, cells, again)
     assert again.started == []
