@@ -60,12 +60,21 @@ class ProgressCSV(BaseCallback):
     def __init__(self, path: str):
         super().__init__()
         self.path = path
+        self._file: CSVOutputFormat | None = None
 
     def _on_training_start(self) -> None:
-        self.logger.output_formats.append(CSVOutputFormat(self.path))
+        self._file = CSVOutputFormat(self.path)
+        self.logger.output_formats.append(self._file)
 
     def _on_step(self) -> bool:
         return True
+
+    def _on_training_end(self) -> None:
+        # The zoo ends its first callback's training once more, even one that never started.
+        if self._file is not None:
+            self.logger.output_formats.remove(self._file)
+            self._file.close()
+            self._file = None
 
 
 class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
