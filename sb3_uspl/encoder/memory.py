@@ -238,8 +238,8 @@ class TransformerMemory(Memory):
         mask = token_mask(lengths)
         n_tokens = mask.shape[1]
         padded = _padded(features, mask)
-        position = th.arange(n_tokens, device=features.device)
-        bias = self._bias(position[:, None], position[None, :])
+        position = th.arange(n_tokens, dtype=features.dtype, device=features.device)
+        bias = self.slopes[:, None, None] * _recency(position[:, None], position)
         keys, values = [], []
         for block in self.blocks:
             q, k, v = block.project(padded)
@@ -261,8 +261,9 @@ class TransformerMemory(Memory):
             padding = (0, 0, 0, keys.shape[3])
             keys, values = F.pad(keys, padding), F.pad(values, padding)
         rows = th.arange(len(features), device=features.device)
-        position = th.arange(n_tokens, device=features.device)
-        bias = self._grouped(self._bias(length[:, None, None], position[None, None, :]).transpose(0, 1))
+        position = th.arange(n_tokens, dtype=features.dtype, device=features.device)
+        recency = _recency(length[:, None].to(features.dtype), position)
+        bias = self._grouped(self.slopes[:, None] * recency[:, None])
         features = features[:, None]
         for index, block in enumerate(self.blocks):
             q, k, v = block.project(features)
@@ -276,16 +277,16 @@ class TransformerMemory(Memory):
 
     def _grouped(self, by_head: th.Tensor) -> th.Tensor:
         """
-        ``(n_envs, n_heads, 1, ...)``, where heads share their keys as ``(n_envs, 1, n_heads, ...)``: the queries of one head,
-        for which the keys are read once.
+        What every head has for one token, ``(n_envs, n_heads, n)`` with any axes of length 1 between; where heads share their
+        keys as ``(n_envs, 1, n_heads, n)``: the queries of one head, for which the keys are read once.
         """
         return by_head.reshape(len(by_head), self.n_key_heads, -1, by_head.shape[-1])
 
-    def _bias(self, query: th.Tensor, key: th.Tensor) -> th.Tensor:
-        """ALiBi penalty, minus infinity for the future; ``(n_heads, *broadcast(query, key))``."""
-        distance = (query - key)[None]
-        slopes = self.slopes.view(-1, *[1] * (distance.dim() - 1))
-        return th.where(distance >= 0, -slopes * distance, -th.inf)
+
+def _recency(query: th.Tensor, key: th.Tensor) -> th.Tensor:
+    """What ALiBi's slopes are multiplied with: minus the distance of two positions, minus infinity for the future."""
+    recency = key - query
+    return recency.masked_fill_(recency > 0.0, -th.inf)
 
 
 class _Block(nn.Module):
