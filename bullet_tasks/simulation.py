@@ -142,7 +142,7 @@ class Simulation:
             baseVisualShapeIndex=self._visual_shape(visuals),
             basePosition=position,
             baseOrientation=quaternion(yaw),
-            # What never moves costs a step half as much as a plain rigid body, with equal results.
+            # What never moves costs a step half of what it would as a multibody, with equal results.
             useMaximalCoordinates=int(mass == 0.0),
         )
         self._ids[name] = body

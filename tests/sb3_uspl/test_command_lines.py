@@ -12,12 +12,14 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_uspl import RESeLPolicy, USPLPolicy
 from sb3_uspl._configs import CONFIGS, load_entries
-from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, is_ours, use_default_config, use_default_folder
+from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, ProgressCSV, is_ours, use_default_config, use_default_folder
 from tests.sb3_uspl.commands import ENV, run, run_apart, train
+from tests.sb3_uspl.test_uspl_ppo import make_model
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +52,18 @@ def test_training_leaves_the_zoos_files_and_every_metric(logs):
     assert expected <= set(rows[0])
     rates = [float(row["train/learning_rate"]) for row in rows if row["train/learning_rate"]]
     assert 0.1 * rates[0] <= rates[-1] < 0.5 * rates[0]  # the cosine, not a constant of the zoo's
+
+
+def test_a_training_closes_its_progress_file(tmp_path):
+    model, callback = make_model(), ProgressCSV(str(tmp_path / "progress.csv"))
+    model.set_logger(Logger(None, []))
+    callback.init_callback(model)
+    callback.on_training_end()  # stopped before it began
+    callback.on_training_start({}, {})
+    (written,) = model.logger.output_formats
+    for _ in range(2):  # the zoo ends its first callback's training twice
+        callback.on_training_end()
+        assert written.file.closed and not model.logger.output_formats
 
 
 def test_evaluation_prints_one_json_object(logs):
