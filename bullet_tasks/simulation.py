@@ -1,9 +1,10 @@
 """One PyBullet client with names instead of ids: loading, stepping, contacts, save and restore, pictures."""
 
+import functools
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,9 @@ import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
 from bullet_tasks.shapes import Box, Cylinder, Shape, Vector3
+
+Quaternion = tuple[float, float, float, float]
+"""A rotation in PyBullet's order: x, y, z, w."""
 
 # Index of the normal force (N) in a record of getContactPoints (PyBullet Quickstart Guide, "getContactPoints").
 _NORMAL_FORCE = 9
@@ -48,7 +52,7 @@ class _Client(BulletClient):
         self._client = pybullet.connect(mode)
 
 
-def quaternion(yaw: float, pitch: float = 0.0) -> tuple[float, float, float, float]:
+def quaternion(yaw: float, pitch: float = 0.0) -> Quaternion:
     """
     Rotation about the vertical axis, after one about the axis to the left, in PyBullet's order (x, y, z, w).
 
@@ -96,9 +100,11 @@ class Simulation:
         self._ids: dict[str, int] = {}
         if gui:
             self.client.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)
-        # Bound once: looking a function up through BulletClient costs as much as a short call.
-        self.step = self.client.stepSimulation
-        self._contact_points = self.client.getContactPoints
+        # What is called in every substep is called without BulletClient, which takes as long to look a function up as a short
+        # call takes, and a third of it to pass the client's number by name.
+        self._client_id = self.client._client
+        self.step: Callable[[], None] = functools.partial(pybullet.stepSimulation, self._client_id)
+        """Let a substep pass."""
 
     def configure(self, substep: float, gravity: float) -> None:
         """
@@ -188,8 +194,37 @@ class Simulation:
         :param pitch: rad, nose down positive
         """
         body = self.body_id(name)
-        self.client.resetBasePositionAndOrientation(body, position, quaternion(yaw, pitch))
-        self.client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self.set_pose(body, position, quaternion(yaw, pitch))
+        self.set_velocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    def set_pose(self, body: int, position: Vector3, orientation: Quaternion) -> None:
+        """
+        Put a body somewhere; its velocity stays what it is.
+
+        :param body: PyBullet's id of the body
+        :param position: m
+        :param orientation: x, y, z, w
+        """
+        pybullet.resetBasePositionAndOrientation(body, position, orientation, self._client_id)
+
+    def set_velocity(self, body: int, linear: Vector3, angular: Vector3) -> None:
+        """
+        Give a body a velocity.
+
+        :param body: PyBullet's id of the body
+        :param linear: of its centre of mass, m/s
+        :param angular: rad/s
+        """
+        pybullet.resetBaseVelocity(body, linear, angular, self._client_id)
+
+    def pose(self, body: int) -> tuple[Vector3, Quaternion]:
+        """
+        Where a body is.
+
+        :param body: PyBullet's id of the body
+        :return: position (m), orientation (x, y, z, w)
+        """
+        return pybullet.getBasePositionAndOrientation(body, self._client_id)  # type: ignore[no-any-return]
 
     def pressed(self, body: int, threshold: float) -> bool:
         """
@@ -198,7 +233,9 @@ class Simulation:
         :param body: PyBullet's id of the body
         :param threshold: normal force that counts, N
         """
-        return any(point[_NORMAL_FORCE] > threshold for point in self._contact_points(body))
+        return any(
+            point[_NORMAL_FORCE] > threshold for point in pybullet.getContactPoints(body, physicsClientId=self._client_id)
+        )
 
     def save(self) -> int:
         """

@@ -59,8 +59,4 @@ class CompiledQuadrotor(Quadrotor):
         if not self._appeared:
             simulation.add_body(self.name, None, looks(), (0.0, 0.0, 0.0))
             self._appeared = True
-        simulation.client.resetBasePositionAndOrientation(
-            simulation.body_id(self.name),
-            (state.x, state.y, state.z),
-            orientation(state),
-        )
+        simulation.set_pose(simulation.body_id(self.name), (state.x, state.y, state.z), orientation(state))

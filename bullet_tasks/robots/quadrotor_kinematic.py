@@ -1,5 +1,7 @@
 """The quadrotor as a rigid body that follows its inner loop exactly: PyBullet says what it touches."""
 
+import math
+
 from bullet_tasks.robots import quadrotor_kernels as kernels
 from bullet_tasks.robots.quadrotor_body import (
     HALF_EXTENTS,
@@ -13,6 +15,7 @@ from bullet_tasks.robots.quadrotor_body import (
     state_of,
 )
 from bullet_tasks.shapes import Box
+from bullet_tasks.simulation import Simulation
 from bullet_tasks.world import World
 
 _DISTANCE = 8  # index in a record of getClosestPoints (PyBullet Quickstart Guide)
@@ -38,20 +41,9 @@ class KinematicQuadrotor(Quadrotor):
         # The margin rounds a box's corners; without it distances are exact, and the same as the compiled quadrotor's.
         simulation.client.changeDynamics(self._id, -1, collisionMargin=0.0)
         self._floors = [simulation.body_id(shape.name) for shape in world.scene.shapes if shape.floor]
-        self._set_pose = simulation.client.resetBasePositionAndOrientation
+        self._clear = math.inf
+        self._world = world
         self._closest_points = simulation.client.getClosestPoints
-
-    def _show(self) -> QuadrotorState:
-        state = state_of(self._flight, self._floor)
-        self._set_pose(self._id, (state.x, state.y, state.z), orientation(state))
-        return state
-
-    def _touches(self) -> bool:
-        for floor in self._floors:
-            for point in self._closest_points(self._id, floor, kernels.TOUCH):
-                if point[_DISTANCE] <= kernels.TOUCH:
-                    return True
-        return False
 
     def reset(self, x: float, y: float, ground: float, yaw: float) -> QuadrotorState:
         """
@@ -62,15 +54,34 @@ class KinematicQuadrotor(Quadrotor):
         :param ground: height of the floor there, m
         :param yaw: rad
         """
-        super().reset(x, y, ground, yaw)
-        self.state = self._show()
-        return self.state
+        # So high nothing can be touched, however the body is tilted.
+        highest = max((shape.top for shape in self._world.scene.shapes if shape.floor), default=-math.inf)
+        self._clear = highest + math.hypot(*HALF_EXTENTS) + kernels.TOUCH
+        return super().reset(x, y, ground, yaw)
 
     def substep(self) -> QuadrotorState:
         """Let 1/50 s pass (see base class)."""
         kernels.fly(self._flight, self._command, self._body)
-        self.state = self._show()
-        touching = self._touches()
-        kernels.ground(self._flight, self._body, touching)
-        self.state = self._show() if touching else state_of(self._flight, self._floor)
+        kernels.ground(self._flight, self._body, self._touches())
+        self.state = state_of(self._flight, self._floor)
         return self.state
+
+    def _touches(self) -> bool:
+        if self._flight[kernels.Z] + self._floor > self._clear:
+            return False
+        self.state = state_of(self._flight, self._floor)
+        self.appear(self._world.simulation)
+        for floor in self._floors:
+            for point in self._closest_points(self._id, floor, kernels.TOUCH):
+                if point[_DISTANCE] <= kernels.TOUCH:
+                    return True
+        return False
+
+    def appear(self, simulation: Simulation) -> None:
+        """
+        Be where ``state`` says; the body is in the world's simulation already (see base class).
+
+        :param simulation: that will take the picture
+        """
+        state = self.state
+        simulation.set_pose(self._id, (state.x, state.y, state.z), orientation(state))

@@ -105,7 +105,6 @@ def test_pybullet_and_the_compiled_ground_agree_to_a_hundredth_of_a_millimetre(m
         for gap in (-1e-5, 1e-5):
             height = kernels.TOUCH + gap + kernels.reach_down(robot._body, roll, pitch)
             robot._flight[[kernels.Z, kernels.ROLL, kernels.PITCH]] = height, roll, pitch
-            robot._show()
             touched.append(robot._touches())
             assert touched[-1] == kernels.touches(robot._flight, robot._body) == (gap < 0.0), (roll, pitch, gap)
     assert sum(touched) == 50

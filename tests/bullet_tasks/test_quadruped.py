@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import numpy as np
 import pytest
 
 from bullet_tasks.robots.quadruped import (
@@ -13,6 +14,7 @@ from bullet_tasks.robots.quadruped import (
     QuadrupedCommand,
     make_quadruped,
 )
+from bullet_tasks.robots.quadruped_body import CONTACT_FORCE
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box
 from bullet_tasks.world import World
@@ -107,6 +109,24 @@ def test_a_body_that_presses_against_a_wall_does_not_tilt():
     _, orientation = simulation.client.getBasePositionAndOrientation(simulation.body_id(robot.name))
     assert abs(orientation[0]) < 1e-5 and abs(orientation[1]) < 1e-5
     world.close()
+
+
+def test_no_contact_of_pybullets_is_missed():
+    # One of the shapes is so low that the trunk lies on it.
+    low = Box("low", (-1.0, 0.0, 0.1), (0.2, 0.2, 0.12))
+    world = World(SceneSpec((*DEAD_END, low)))
+    robot = make_quadruped(world, "kinematic")
+    body = world.simulation.body_id(robot.name)
+    rng, touched, steps = np.random.default_rng(0), 0, 0
+    for _ in range(20):
+        robot.reset(*rng.uniform(-1.5, 0.5, 2), 0.0, rng.uniform(-math.pi, math.pi))
+        robot.command(QuadrupedCommand(WALKING_SPEED, rng.uniform(-math.pi, math.pi)))
+        for _ in range(60):
+            state = robot.substep()
+            assert state.in_contact == world.simulation.pressed(body, CONTACT_FORCE)
+            touched, steps = touched + state.in_contact, steps + 1
+    world.close()
+    assert 0.1 < touched / steps < 0.9
 
 
 def test_a_narrow_dead_end_lets_the_body_out_again(make):
