@@ -317,15 +317,15 @@ def table(found: list[Agent]) -> str:
     :return: one row each, Markdown
     """
     lines = [
-        "| environment | algorithm, seed | deployment policy | privileged policy | decisions | wall time | command |",
-        "|---|---|---|---|---|---|---|",
+        "| environment | algorithm, seed | deployment policy | privileged policy | decisions | wall time |",
+        "|---|---|---|---|---|---|",
     ]
     for agent in found:
         result = agent.evaluation()
         rates = [_success(result, prefix) if result else "not evaluated" for prefix in ("", "privileged_")]
         decisions, seconds = agent.training()
         name = f"{_NAMES.get(agent.algo, agent.algo)}, {agent.arguments().get('seed')}"
-        numbers = (_decisions(decisions), _clock(seconds), ", then ".join(f"`{command}`" for command in agent.commands()))
+        numbers = (_decisions(decisions), _clock(seconds))
         link = f"[`{agent.env}`](trained_agents/{agent.algo}/{agent.env}_{agent.number}/README.md)"
         lines.append("| " + " | ".join((link, name, *rates, *numbers)) + " |")
     return "\n".join(lines)

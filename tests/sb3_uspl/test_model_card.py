@@ -119,7 +119,7 @@ def test_the_table_has_a_row_for_each_agent_in_order(tmp_path):
     write_agent(tmp_path)
     rows = table(agents(tmp_path)).splitlines()[2:]
     assert [("SquareMaze" in row, "RMA" in row) for row in rows] == [(False, False), (False, True), (True, False)]
-    assert all(row.count("|") == 8 and "98.0 % (95.0-99.2)" in row for row in rows)
+    assert all(row.count("|") == 7 and "98.0 % (95.0-99.2)" in row for row in rows)
 
 
 def test_the_table_takes_its_place_and_nothing_else():
