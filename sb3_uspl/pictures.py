@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.typing import ColorType
 
 from sb3_uspl.evaluation import EpisodeRecord, mean_over_time
 
@@ -73,20 +74,40 @@ def _read_progress(path: Path) -> pd.DataFrame:
 def _plot_seeds(
     axis: Axes, runs: Sequence[pd.DataFrame], column: str, label: str, colour: str, scale: float = 1.0, dashes: str = "-"
 ) -> None:
-    """One thin line a run and their mean; a column is logged in a part of the rows only."""
+    """A column is logged in a part of the rows only."""
     curves = [run[[_STEPS, column]].dropna().to_numpy().T for run in runs if column in run]
-    curves = [curve for curve in curves if curve.size]
-    if not curves:
-        return
+    curves = [(x, scale * y) for x, y in curves if len(x)]
+    if curves:
+        dotted = column.startswith("eval/") or max(len(x) for x, _ in curves) == 1
+        plot_seeds(axis, curves, colour, label, dashes, marker="o" if dotted else "")
+
+
+def plot_seeds(
+    axis: Axes,
+    curves: Sequence[tuple[np.ndarray, np.ndarray]],
+    colour: ColorType,
+    label: str | None = None,
+    dashes: str = "-",
+    marker: str = "",
+) -> None:
+    """
+    One thin line a seed and, thick, their mean where all have values.
+
+    :param axis: to draw on
+    :param curves: x and y of every seed, at least one; they need not have the same x
+    :param colour: of all lines
+    :param label: of the mean
+    :param dashes: style of the lines
+    :param marker: of the mean's points
+    """
     if len(curves) > 1:
         for x, y in curves:
-            axis.plot(x, scale * y, dashes, color=colour, linewidth=0.7, alpha=0.5)
+            axis.plot(x, y, dashes, color=colour, linewidth=0.7, alpha=0.5)
     first, last = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
     grid = np.unique(np.concatenate([x for x, _ in curves]))
     grid = grid[(grid >= first) & (grid <= last)]
     mean = np.mean([np.interp(grid, x, y) for x, y in curves], axis=0)
-    marker = "o" if column.startswith("eval/") or len(grid) == 1 else ""
-    axis.plot(grid, scale * mean, dashes, color=colour, linewidth=2.0, marker=marker, markersize=3.5, label=label)
+    axis.plot(grid, mean, dashes, color=colour, linewidth=2.0, marker=marker, markersize=3.5, label=label)
 
 
 def _shade_schedule(axis: Axes, run: pd.DataFrame, label: bool) -> None:

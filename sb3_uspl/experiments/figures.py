@@ -13,7 +13,7 @@ from sb3_uspl.evaluation import mean_over_time
 from sb3_uspl.experiments.plan import Cell, Experiment, Plan, variant_of
 from sb3_uspl.experiments.recording import episodes
 from sb3_uspl.experiments.results import Results, Summary
-from sb3_uspl.pictures import DEPLOYMENT_COLOUR, PRIVILEGED_COLOUR, SIGMA_COLOUR
+from sb3_uspl.pictures import DEPLOYMENT_COLOUR, PRIVILEGED_COLOUR, SIGMA_COLOUR, plot_seeds
 
 DPI = 110
 PANEL = (4.4, 3.2)
@@ -99,14 +99,16 @@ class Figures:
         for env, axis in zip(_envs(measured), axes, strict=True):
             for i, column in enumerate(experiment.columns):
                 curves = [result["learning_curve"] for cell, result in measured if (cell.env, cell.variant) == (env, column)]
-                curves = [curve for curve in curves if curve["timesteps"]]
-                for n, curve in enumerate(curves):
-                    label = self.plan.label(column) if n == 0 else None
-                    rate = 100.0 * np.array(curve["success_rate"])
-                    steps = np.array(curve["timesteps"]) / 1000.0
-                    axis.plot(steps, rate, color=self._colours[i % 10], label=label, marker="." if len(rate) < 3 else "")
+                curves = [
+                    (np.array(curve["timesteps"]) / 1000.0, 100.0 * np.array(curve["success_rate"]))
+                    for curve in curves
+                    if curve["timesteps"]
+                ]
+                if curves:
+                    marker = "o" if min(len(steps) for steps, _ in curves) < 3 else ""
+                    plot_seeds(axis, curves, self._colours[i % 10], self.plan.label(column), marker=marker)
             axis.set(title=env, xlabel="decisions in training (thousands)", ylabel="success (%)", ylim=(-3.0, 103.0))
-        axes[0].legend(fontsize="x-small")
+        _legend(figure, axes)
         figure.savefig(path)
 
     def _divergence(self, experiment: Experiment, measured: list[tuple[Cell, dict]], path: Path) -> None:
@@ -128,7 +130,7 @@ class Figures:
             axis.set_ylim(bottom=0.0)
             error_axis.set_ylabel("prediction error (dashed)")
             error_axis.set_ylim(bottom=0.0)
-        axes[0].legend(fontsize="x-small")
+        _legend(figure, axes)
         figure.savefig(path)
 
     def _paths(self, experiment: Experiment, measured: list[tuple[Cell, dict]], path: Path) -> None:
@@ -143,7 +145,7 @@ class Figures:
                     x = episode["position"][:, 0]
                     axis.plot(period * np.arange(len(x)), x, color=colour, alpha=0.6, label=policy if i == 0 else None)
             axis.set(title=f"{self.plan.label(cell.variant)}, {cell.env}", xlabel="time (s)", ylabel="x")
-        axes[0].legend(fontsize="x-small")
+        _legend(figure, axes)
         figure.savefig(path)
 
     def _belief(self, experiment: Experiment, measured: list[tuple[Cell, dict]], path: Path) -> None:
@@ -198,6 +200,12 @@ def _panels(n: int) -> tuple[Figure, list[Axes]]:
     for axis in axes[:n]:
         axis.grid(alpha=0.25)
     return figure, axes[:n]
+
+
+def _legend(figure: Figure, axes: Sequence[Axes]) -> None:
+    """One for all panels, below them: a line may be in some of them only."""
+    handles = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 8), fontsize="small")
 
 
 def _envs(measured: list[tuple[Cell, dict]]) -> list[str]:
