@@ -215,8 +215,10 @@ def ask_symmetries(env: VecEnv | None, given: Sequence[Symmetry] | bool) -> tupl
 
     :param env: is asked for them if ``given`` is True
     :param given: wins over the environment's; False: none are used
-    :raises ValueError: if there are none, they do not fit the observations, or ``common`` is normalised
+    :raises ValueError: if there are none or nobody to ask, they do not fit the observations, or ``common`` is normalised
     """
+    if env is None and given is True:
+        raise ValueError("symmetries=True asks the environment for them: pass `env`, too.")
     if env is None or not given:
         return tuple(given or ())  # type: ignore[arg-type]
     if given is True:

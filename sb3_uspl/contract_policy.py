@@ -78,8 +78,9 @@ class ContractPolicy(ActorCriticPolicy):
             raise ValueError(
                 f"The observation has the keys {sorted(observation)}; the deployment policy also needs {missing}."
             )
-        # Images with the channels last come as the environment has them, while the training saw SB3's transposed ones.
-        arrays = {key: maybe_transpose(np.asarray(observation[key]), self.contract[key]) for key in keys}
+        # Images with the channels last come as the environment has them, while the training saw SB3's transposed ones. Copies,
+        # as in SB3: torch takes no views that run backwards, and the encoder scales images in place.
+        arrays = {key: maybe_transpose(np.array(observation[key]), self.contract[key]) for key in keys}
         check_finite(arrays)
         vectorized = is_vectorized_observation(arrays[COMMON], self.contract[COMMON])
         if not vectorized:

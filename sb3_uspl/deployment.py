@@ -49,8 +49,8 @@ class DeploymentPolicy(nn.Module):
     A copy of the deployment policy whose memory is an argument and a result, deterministic, for any number of robots.
 
     ``forward`` takes what ``inputs`` lists and returns what ``outputs`` lists, in these orders. What the environment returns
-    goes in as it is and the action that comes out goes to the robot as it is: normalisation, uncertainty smoothing, previous
-    action and clipping are inside.
+    goes in as it is, images with the channels first, and the action that comes out goes to the robot as it is: normalisation,
+    uncertainty smoothing, previous action and clipping are inside.
 
     :param policy: trained policy, on any device
     :param horizon: decisions that a Transformer remembers; up to that many it acts as in training, then it forgets the oldest
@@ -125,7 +125,7 @@ class DeploymentPolicy(nn.Module):
             if policy.bounded_mean:
                 raw = policy.action_centre + policy.action_half_range * th.tanh(raw)
             low, high = th.as_tensor(space.low), th.as_tensor(space.high)
-            actions = raw.reshape(-1, *space.shape).clamp(low, high)
+            actions = raw.reshape(-1, *space.shape).clamp(low, high).float()
         elif isinstance(space, spaces.Discrete):
             actions = raw.argmax(dim=1)
         elif isinstance(space, spaces.MultiDiscrete):

@@ -71,13 +71,14 @@ def run_episodes(
         alive = np.arange(venv.num_envs) < n_episodes - first
         venv.seed(seed + first)
         obs: Any = venv.reset()
-        infos: list[dict[str, Any]] = venv.reset_infos
+        infos: list[dict[str, Any]] = venv.unwrapped.reset_infos  # a wrapper's own are empty
+        placed = ["position" in info for info in infos]
         state: tuple[np.ndarray, ...] | None = None
         starts = np.ones(venv.num_envs, dtype=bool)
         while alive.any():
             actions, state = act(obs, state, starts)
             for i in np.flatnonzero(alive).tolist():
-                wave[i].positions.append(np.asarray(infos[i].get("position", obs[COMMON][i])))
+                wave[i].positions.append(np.array(infos[i]["position"] if placed[i] else obs[COMMON][i]))
                 if isinstance(state, DeploymentState):
                     wave[i].truth.append(obs[PRIVILEGED][i].copy())
                     wave[i].belief_mean.append(state.belief_mean[i])

@@ -114,7 +114,7 @@ def _describe(policy: DeploymentPolicy) -> dict[str, Any]:
     return {
         "arrays": "the first axis of every array is the robots, of any number; 'shape' leaves it out",
         "deterministic": True,
-        "normalisation": "none is needed: raw observations go in, the action for the environment comes out",
+        "normalisation": "none is needed: raw observations go in (images: channels first), the robot's action comes out",
         "inputs": [part.name for part in policy.inputs],
         "outputs": [part.name for part in policy.outputs],
         "observation": [_card(part, network.contract[part.name]) for part in policy.inputs if part.initial is None],

@@ -100,10 +100,10 @@ class HiddenParameters(gym.Wrapper):
             self._rng = np.random.default_rng([seed, _STREAM])
         hidden: dict[str, float] = {}
         for dim, (name, values) in enumerate(self.parameters.items()):
-            drawn = self._rng.uniform(*values) if isinstance(values, tuple) else self._rng.choice(values)
+            drawn = self._rng.uniform(*values) if isinstance(values, tuple) else values[self._rng.integers(len(values))]
             hidden[name] = float(drawn)
             self._privileged[dim] = self._observed(dim, hidden[name])
-            setattr(self.env.unwrapped, name, hidden[name])
+            setattr(self.env.unwrapped, name, drawn)
         obs, info = self.env.reset(seed=seed, options=options)
         return self._observation(obs), {**info, "hidden": hidden}
 

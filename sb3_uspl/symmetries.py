@@ -44,18 +44,21 @@ class SymmetryGroup(nn.Module):
         _check_closed(pairs)
         for name, matrices in zip(("common", "privileged"), zip(*pairs, strict=True), strict=True):
             self.register_buffer(name, th.as_tensor(np.stack(matrices), dtype=th.float32), persistent=False)
-        weights = _NEXT_COORDINATE ** th.arange(n_common)
-        self.register_buffer("_rank", th.einsum("i,gij->gj", weights, self.common), persistent=False)
+        common = self.common.double()
+        changed = (common - common[0]).abs().sum((0, 2)).nonzero()[:, 0]
+        rank = th.einsum("i,gij->gj", _NEXT_COORDINATE ** th.arange(len(changed), dtype=th.float64), common[:, changed])
+        # Relative to the identity's: coordinates that no symmetry changes would drown the others.
+        self.register_buffer("_rank", rank - rank[0], persistent=False)
 
     def canonical(self, common: th.Tensor) -> th.Tensor:
         """
-        The same symmetry for all positions that look the same, but for this: which makes the first coordinate greatest, or the
-        next one if that leaves a choice.
+        The same symmetry for all positions that look the same, but for this: which makes the first coordinate greatest that
+        symmetries change, or the next one if that leaves a choice; seven of them count, of which each weighs a hundredth.
 
         :param common: ``(n, n_common)``
         :return: numbers of symmetries, ``(n,)``
         """
-        return (common @ self._rank.T).argmax(dim=1)
+        return (common.to(self._rank.dtype) @ self._rank.T).argmax(dim=1)
 
     def random(self, lengths: th.Tensor, rng: np.random.Generator) -> th.Tensor:
         """

@@ -2,12 +2,11 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -17,6 +16,7 @@ from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl import _arguments
+from sb3_uspl._experience import WrappedExperience
 from sb3_uspl._threads import run_side_by_side, torch_threads
 from sb3_uspl.buffers import EpisodeReplayBuffer, USPLRolloutBuffer
 from sb3_uspl.distributions import CorrelatedGaussianDistribution
@@ -29,10 +29,8 @@ from sb3_uspl.symmetries import Symmetry
 from sb3_uspl.uncertainty import C_MAX, C_MIN, DELTA, smoothing_factor
 from sb3_uspl.wrappers import UncertaintyConfig, UncertaintyVecWrapper
 
-SelfUSPLPPO = TypeVar("SelfUSPLPPO", bound="USPLPPO")
 
-
-class USPLPPO(PPO):
+class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
     """
     Uncertainty-Sensitive Privileged Learning (Luo, Yuan, Yu; NeurIPS 2025) with PPO.
 
@@ -263,7 +261,6 @@ class USPLPPO(PPO):
         self.encoder_window, self.encoder_window_timesteps = encoder_window, encoder_window_timesteps
         self.encoder_bf16, self.encoder_compile = encoder_bf16, encoder_compile
         self.context_length, self.symmetries = context_length, symmetries
-        self._rollout_env: UncertaintyVecWrapper | None = None
         self._progress_period: tuple[int, int] | None = None
         self._replay_is_lost = False
         self._restarted: bool | None = None
@@ -344,18 +341,6 @@ class USPLPPO(PPO):
 
     # -- training ----------------------------------------------------------------------------------------------------------
 
-    def learn(
-        self: SelfUSPLPPO,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfUSPLPPO:
-        name = tb_log_name or type(self).__name__
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
-
     def _setup_learn(
         self,
         total_timesteps: int,
@@ -364,12 +349,10 @@ class USPLPPO(PPO):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        fresh = reset_num_timesteps or self._last_obs is None
         if self.num_timesteps > 0:
             _arguments.count_mismatched(self)  # more strictly than when it was loaded
         if not len(self._episodes.replay):
             self._replay_is_lost = not reset_num_timesteps and self.num_timesteps > 0
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         warmup, ramp = int(0.2 * total_timesteps), int(0.5 * total_timesteps)
         if self._progress_period is not None and not reset_num_timesteps:
             warmup, ramp = self._progress_period
@@ -377,21 +360,20 @@ class USPLPPO(PPO):
             warmup if self.warmup_timesteps is None else self.warmup_timesteps,
             ramp if self.ramp_timesteps is None else self.ramp_timesteps,
         )
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._restarted is None or reset_num_timesteps:
             self._restarted = self.progress > 0.0
-        assert self.env is not None and isinstance(self._last_obs, dict)
-        wrapper = self._rollout_env
-        if wrapper is None or wrapper.venv is not self.env or wrapper.encoder is not self.policy.encoder:
-            wrapper = self._make_rollout_env(self.env)
-            self._rollout_env, fresh = wrapper, True
-        if fresh:
-            self._episodes.forget_running()
-            wrapper.progress = self.progress  # the first observation is blurred like those after it
-            self._last_obs = wrapper.begin(self._last_obs)
         return result
+
+    def _start_episodes(self, wrapper: UncertaintyVecWrapper) -> None:
+        assert isinstance(self._last_obs, dict)
+        self._episodes.forget_running()
+        wrapper.progress = self.progress  # the first observation is blurred like those after it
+        self._last_obs = wrapper.begin(self._last_obs)
 
     def _make_rollout_env(self, env: VecEnv) -> UncertaintyVecWrapper:
         """What the experience is collected in; the baselines have others."""
+        _arguments.ask_symmetries(env, self.symmetries)  # `set_env` may have brought a normalisation
         return UncertaintyVecWrapper(env, self.policy.encoder, self._uncertainty_config, self.seed)
 
     @property
@@ -409,11 +391,11 @@ class USPLPPO(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        # `model.env` stays what the user gave (callbacks, VecNormalize, set_env rely on it); only experience is transformed.
         wrapper = self._rollout_env
         assert wrapper is not None and env is self.env
-        if self.policy_restart and not self._restarted and self.progress > 0.0:
-            self.policy.restart(self.lr_schedule)
+        if self.progress > 0.0 and not self._restarted:
+            if self.policy_restart:
+                self.policy.restart(self.lr_schedule)
             self._restarted = True
         wrapper.progress = self.progress
         if self.mismatch_hold_time is None:
@@ -429,12 +411,7 @@ class USPLPPO(PPO):
             self.policy.action_dist.correlation = correlation
         # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.
         with torch_threads(1):
-            try:
-                return super().collect_rollouts(wrapper, callback, rollout_buffer, n_rollout_steps)
-            except BaseException:
-                # Ctrl-C, or an environment's error: the environments may be a decision ahead of what is stored.
-                self._last_obs = None
-                raise
+            return self._collect_in_wrapper(callback, rollout_buffer, n_rollout_steps)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         """Episode statistics of the privileged policy, without the mismatched environments."""
@@ -492,9 +469,6 @@ class USPLPPO(PPO):
         return min(one_pass, self.encoder_updates)
 
     # -- saving ------------------------------------------------------------------------------------------------------------
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rollout_env"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "policy.encoder_optimizer"], []

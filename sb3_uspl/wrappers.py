@@ -9,9 +9,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_uspl._experience import ExperienceVecWrapper
 from sb3_uspl.encoder import ObservationEncoder, encode_actions, reset_rows, take_rows
 from sb3_uspl.observations import (
     BELIEF,
@@ -24,7 +25,6 @@ from sb3_uspl.observations import (
     TRUTH,
     UNCERTAINTY,
     check_finite,
-    check_vec_wrappers,
 )
 from sb3_uspl.uncertainty import (
     C_MAX,
@@ -157,7 +157,7 @@ class Wandering:
         return np.clip(self.middle + half * spread * self.rng.standard_normal(space.shape), space.low, space.high)
 
 
-class UncertaintyVecWrapper(VecEnvWrapper):
+class UncertaintyVecWrapper(ExperienceVecWrapper):
     """
     Runs the encoder beside the environments (Alg. 1, lines 5-10).
 
@@ -179,13 +179,13 @@ class UncertaintyVecWrapper(VecEnvWrapper):
     :raises ValueError: if images or the privileged observation are normalised
     """
 
+    encoder: ObservationEncoder
+
     def __init__(self, venv: VecEnv, encoder: ObservationEncoder, config: UncertaintyConfig, seed: int | None = None):
-        check_vec_wrappers(venv)
-        super().__init__(venv)
-        self.encoder, self.config = encoder, config
+        super().__init__(venv, encoder)
+        self.config = config
         self.progress = 0.0
         self.rng = np.random.default_rng(seed)
-        self.device = next(encoder.parameters()).device
         space = venv.observation_space[PRIVILEGED]  # type: ignore[index]
         self.low, self.high = space.low, space.high
         self.noise = BlurNoise(self.num_envs, space.shape[0], config, self.rng)
@@ -199,12 +199,9 @@ class UncertaintyVecWrapper(VecEnvWrapper):
             share = np.where(np.arange(self.num_envs) < self._n_matched, 0.0, config.wander_share)
             self._wandering = Wandering(venv.action_space, share, config.wander_hold, self.rng, config.wander_actions)
 
-    def reset(self) -> VecEnvObs:
-        return self.begin(self.venv.reset())  # type: ignore[arg-type]
-
     def begin(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        Start with an empty history.
+        Start with an empty history (see base class).
 
         :param obs: current observation of the wrapped environments, or one returned by this wrapper
         :return: observation for the policy

@@ -1,29 +1,27 @@
 """RESeL-PPO as the paper runs it (App. C.2): the deployment policy itself is trained, by PPO alone."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uspl._arguments import check_action_std
+from sb3_uspl._experience import WrappedExperience
 from sb3_uspl.baselines.resel_policy import RESeLPolicy
 from sb3_uspl.baselines.sequences import HistoryVecWrapper, SequenceRolloutBuffer
 from sb3_uspl.observations import check_observation_space, check_vec_wrappers
 from sb3_uspl.schedules import CosineSchedule, falling
 
-SelfRESeLPPO = TypeVar("SelfRESeLPPO", bound="RESeLPPO")
 
-
-class RESeLPPO(PPO):
+class RESeLPPO(WrappedExperience[HistoryVecWrapper]):
     """
     The deployment policy, a Transformer, trained end to end by PPO on whole sequences (App. C.2; RESeL: Luo et al., 2024).
 
@@ -97,7 +95,6 @@ class RESeLPPO(PPO):
         self.action_std, self.action_std_floor = action_std, action_std_floor
         self.encoder_learning_rate = encoder_learning_rate
         self.context_length = context_length
-        self._rollout_env: HistoryVecWrapper | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -134,42 +131,17 @@ class RESeLPPO(PPO):
             raise ValueError(f"context_length={self.context_length}: an episode has one decision at least.")
         check_action_std(self.action_std, self.action_space, self.policy_kwargs)
 
-    def learn(
-        self: SelfRESeLPPO,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfRESeLPPO:
-        name = tb_log_name or type(self).__name__
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+    def _make_rollout_env(self, env: VecEnv) -> HistoryVecWrapper:
+        return HistoryVecWrapper(env, self.policy.encoder)
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        fresh = reset_num_timesteps or self._last_obs is None
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        assert self.env is not None and isinstance(self._last_obs, dict)
-        wrapper = self._rollout_env
-        if wrapper is None or wrapper.venv is not self.env or wrapper.encoder is not self.policy.encoder:
-            wrapper = self._rollout_env = HistoryVecWrapper(self.env, self.policy.encoder)
-            fresh = True
-        if fresh:
-            self.rollout_buffer.forget_running()
-            self._last_obs = wrapper.begin(self._last_obs)
-        return result
+    def _start_episodes(self, wrapper: HistoryVecWrapper) -> None:
+        assert isinstance(self._last_obs, dict)
+        self.rollout_buffer.forget_running()
+        self._last_obs = wrapper.begin(self._last_obs)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        # `model.env` stays what the user gave, as in USPLPPO.
         wrapper, buffer = self._rollout_env, rollout_buffer
         assert wrapper is not None and env is self.env and isinstance(buffer, SequenceRolloutBuffer)
         assert self._last_episode_starts is not None
@@ -178,15 +150,7 @@ class RESeLPPO(PPO):
             self.policy.set_action_std(self._action_std_share(self._current_progress_remaining) * np.asarray(self.action_std))
         buffer.keep_running(self._last_episode_starts)
         self._last_obs = wrapper.resume(*buffer.running_tokens())  # type: ignore[assignment]
-        going_on = False
-        try:
-            going_on = super().collect_rollouts(wrapper, callback, buffer, n_rollout_steps)
-        finally:
-            if not going_on:
-                # SB3 leaves out the decision at which a callback stops, as does an interrupt: the history has a gap, so the
-                # episodes start anew.
-                self._last_obs = None
-        return going_on
+        return self._collect_in_wrapper(callback, buffer, n_rollout_steps)
 
     def train(self) -> None:
         """PPO's update, through the memory; then the normalisers, which must not change within it."""
@@ -198,6 +162,3 @@ class RESeLPPO(PPO):
         learning_rate = self.encoder_lr_schedule(self._current_progress_remaining)
         self.policy.optimizer.param_groups[1]["lr"] = learning_rate
         self.logger.record("encoder/learning_rate", learning_rate)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rollout_env"]

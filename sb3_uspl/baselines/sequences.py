@@ -9,10 +9,10 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
+from sb3_uspl._experience import ExperienceVecWrapper
 from sb3_uspl.encoder import MemoryState, ObservationEncoder, Tokens, encode_actions, reset_rows
 from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_finite
 
@@ -75,25 +75,20 @@ class HistoryEncoder(nn.Module):
         return self.embedding(remembered), state
 
 
-class HistoryVecWrapper(VecEnvWrapper):
+class HistoryVecWrapper(ExperienceVecWrapper):
     """
     Runs the memory beside the environments: adds the embedding of the history and the previous action to observations.
 
     :param venv: environments under the observation contract
     :param encoder: whose memory it is
+    :raises ValueError: if images or the privileged observation are normalised
     """
 
-    def __init__(self, venv: VecEnv, encoder: HistoryEncoder):
-        super().__init__(venv)
-        self.encoder = encoder
-        self.device = next(encoder.parameters()).device
-
-    def reset(self) -> VecEnvObs:
-        return self.begin(self.venv.reset())  # type: ignore[arg-type]
+    encoder: HistoryEncoder
 
     def begin(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        Start with an empty history.
+        Start with an empty history (see base class).
 
         :param obs: current observation of the wrapped environments, or one returned by this wrapper
         :return: observation for the policy

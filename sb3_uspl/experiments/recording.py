@@ -73,7 +73,7 @@ def run_forced(
     alive = np.arange(venv.num_envs) < n_episodes
     venv.seed(seed)
     obs: Any = venv.reset()
-    infos: list[dict[str, Any]] = venv.reset_infos
+    infos: list[dict[str, Any]] = venv.unwrapped.reset_infos
     state: tuple[Any, ...] | None = None
     starts, t = np.ones(venv.num_envs, dtype=bool), 0
     while alive.any():
@@ -81,7 +81,7 @@ def run_forced(
         truth = obs[PRIVILEGED] if privileged else None
         actions, state = policy.act(obs, state, starts, True, privileged=truth, uncertainty=uncertainty)
         for i in np.flatnonzero(alive).tolist():
-            records[i].positions.append(np.asarray(infos[i].get("position", obs[COMMON][i])))
+            records[i].positions.append(np.array(infos[i].get("position", obs[COMMON][i])))
             records[i].truth.append(obs[PRIVILEGED][i].copy())
             assert isinstance(state, DeploymentState)
             records[i].belief_mean.append(state.belief_mean[i])

@@ -5,6 +5,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_uspl import USPLPPO
 from sb3_uspl.evaluation import EpisodeRecord, evaluate, mean_over_time, run_episodes, success_rate, trajectory_divergence
@@ -46,6 +47,36 @@ def test_episodes_do_not_depend_on_their_neighbours(model):
     for a, b in zip(alone, together, strict=True):
         np.testing.assert_allclose(a.belief_mean, b.belief_mean, atol=1e-5)
         assert a.reward == pytest.approx(b.reward, abs=1e-4)
+
+
+class PlacedEnv(UnequalEnv):
+    """Says where it is in one array that it changes, from the start or from the first step on."""
+
+    at_start = True
+
+    def reset(self, *, seed=None, options=None):
+        self.place = np.array([5.0, 0.0])
+        obs, _ = super().reset(seed=seed)
+        return obs, {"position": self.place} if self.at_start else {}
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        self.place[1] += 1.0
+        return obs, reward, terminated, truncated, {**info, "position": self.place}
+
+
+@pytest.mark.parametrize("wrap", [lambda venv: venv, VecMonitor])
+def test_positions_are_the_environments_at_their_time(model, wrap):
+    (record,) = run_episodes(model, wrap(make_vec_env(PlacedEnv, 1)), 1, seed=1)
+    assert np.stack(record.positions).tolist() == [[5.0, 0.0], [5.0, 1.0]]
+
+
+def test_positions_that_are_not_known_from_the_start_are_left_alone(model):
+    class Late(PlacedEnv):
+        at_start = False
+
+    (record,) = run_episodes(model, make_vec_env(Late, 1), 1, seed=1)
+    np.testing.assert_allclose(np.stack(record.positions)[:, 0], [0.0, 1 / 2])  # the common observation's time
 
 
 def test_it_agrees_with_sb3(model):

@@ -76,6 +76,14 @@ def test_a_policy_starts_anew_after_the_warm_up_once_whenever_it_was_saved(tmp_p
     assert (loaded.policy.action_net.weight != model.policy.action_net.weight).any() == anew
 
 
+def test_a_policy_that_is_past_its_warm_up_does_not_start_anew_because_the_configuration_says_so(tmp_path):
+    model = make_model(warmup_timesteps=8 * 16, ramp_timesteps=0).learn(8 * 16 * 3)
+    model.save(tmp_path / "model")
+    loaded = USPLPPO.load(tmp_path / "model", env=make_venv(8), learning_rate=0.0, policy_restart=True)
+    loaded.learn(8 * 16 * 2, reset_num_timesteps=False)
+    assert (loaded.policy.action_net.weight == model.policy.action_net.weight).all()
+
+
 @pytest.mark.parametrize("algorithm", [USPLPPO, RESeLPPO])
 def test_a_learning_rate_given_to_load_falls_as_one_given_before_does(tmp_path, algorithm):
     algorithm("MlpPolicy", make_venv(8), n_steps=16, batch_size=32, learning_rate_floor=0.1).save(tmp_path / "model")

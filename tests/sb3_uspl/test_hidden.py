@@ -59,6 +59,14 @@ def test_what_is_observed_is_what_the_environment_has():
         np.testing.assert_array_equal(env.step(env.action_space.sample())[0]["privileged"], obs["privileged"])
 
 
+def test_a_whole_number_stays_one():
+    env = gym.make("CartPole-v1")
+    env.unwrapped.n_skip = 1
+    wrapped = HiddenParameters(env, {"n_skip": [1, 2, 4]})
+    drawn = {repr(wrapped.reset(seed=seed)[1]["hidden"]["n_skip"]): env.unwrapped.n_skip for seed in range(20)}
+    assert drawn == {"1.0": 1, "2.0": 2, "4.0": 4} and all(type(value) is int for value in drawn.values())
+
+
 def test_the_hidden_sign_turns_the_carts_push_round():
     env, pushed = cart_pole(), {}
     for seed in range(20):

@@ -229,6 +229,18 @@ def test_the_deployment_policy_sees_the_image_and_nothing_privileged():
     assert not np.allclose(action, other)
 
 
+def test_an_image_that_is_predicted_on_stays_what_it_was():
+    """Also one of another type than the space's, seen backwards through a view."""
+    model = make_model(HALVES)
+    image = np.linspace(-1.0, 1.0, 36 * 48, dtype=np.float32).reshape(1, 36, 48)
+    before = image.copy()
+    actions = [model.predict({"common": np.zeros(2, np.float32), "target": image[..., ::-1]}, deterministic=True)[0]]
+    actions.append(
+        model.predict({"common": np.zeros(2, np.float32), "target": before[..., ::-1].copy()}, deterministic=True)[0]
+    )
+    assert (image == before).all() and actions[0] == actions[1]
+
+
 @pytest.mark.parametrize(
     ("size", "preset", "least"), [((1, 15, 40), "small", 16), ((1, 40, 15), "small", 16), ((1, 9, 20), "paper", 10)]
 )

@@ -85,6 +85,23 @@ def test_one_of_all_that_look_the_same_is_seen():
     assert (one_side.turn(obs, one_side.canonical(obs[COMMON]))[COMMON][:, 1] >= 0.0).all()
 
 
+@pytest.mark.parametrize(("n_common", "mirrored"), [(2, 0), (6, 5), (30, 25)])
+def test_wherever_the_mirrored_coordinate_stands(n_common, mirrored):
+    matrix = np.eye(n_common)
+    matrix[mirrored, mirrored] = -1.0
+    group, obs = SymmetryGroup([(matrix, np.eye(2))], n_common, 2), situations(100, n_common)
+    seen = group.turn(obs, group.canonical(obs[COMMON]))
+    assert (seen[COMMON][:, mirrored] >= 0.0).all()
+    others = [i for i in range(n_common) if i != mirrored]
+    assert (seen[COMMON][:, others] == obs[COMMON][:, others]).all()
+
+
+def test_symmetries_of_no_environment_cannot_be_asked_for(tmp_path):
+    make_model(symmetries=False).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="pass `env`"):
+        USPLPPO.load(tmp_path / "model", symmetries=True)
+
+
 @pytest.mark.parametrize("symmetries", [False, True])
 def test_actor_and_critic_do_alike_where_the_world_looks_the_same_if_they_are_told(symmetries):
     class Turned(ToyEnv):
