@@ -66,6 +66,14 @@ class WrappedExperience(PPO, Generic[WrapperT]):
         """What the experience is collected in."""
         raise NotImplementedError
 
+    def _prepare(self, total_timesteps: int, reset_num_timesteps: bool) -> None:
+        """
+        What comes before the first episode of a training.
+
+        :param total_timesteps: as for ``learn``
+        :param reset_num_timesteps: as for ``learn``
+        """
+
     def _start_episodes(self, wrapper: WrapperT) -> None:
         """Begin new episodes in the wrapper, and forget those that were running."""
         raise NotImplementedError
@@ -90,6 +98,7 @@ class WrappedExperience(PPO, Generic[WrapperT]):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        self._prepare(total_timesteps, reset_num_timesteps)
         if self._rollout_env is not None and not self._rollout_env.was_left_alone():
             self._last_obs = None
         fresh = reset_num_timesteps or self._last_obs is None

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -263,7 +263,7 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
         self.context_length, self.symmetries = context_length, symmetries
         self._progress_period: tuple[int, int] | None = None
         self._replay_is_lost = False
-        self._restarted: bool | None = None
+        self._past_warmup: bool | None = None  # in the rollout before; None: there is none
         if _init_setup_model:
             self._setup_model()
 
@@ -341,14 +341,7 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
 
     # -- training ----------------------------------------------------------------------------------------------------------
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
+    def _prepare(self, total_timesteps: int, reset_num_timesteps: bool) -> None:
         if self.num_timesteps > 0:
             _arguments.count_mismatched(self)  # more strictly than when it was loaded
         if not len(self._episodes.replay):
@@ -360,10 +353,8 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
             warmup if self.warmup_timesteps is None else self.warmup_timesteps,
             ramp if self.ramp_timesteps is None else self.ramp_timesteps,
         )
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if self._restarted is None or reset_num_timesteps:
-            self._restarted = self.progress > 0.0
-        return result
+        if reset_num_timesteps:
+            self._past_warmup = None
 
     def _start_episodes(self, wrapper: UncertaintyVecWrapper) -> None:
         assert isinstance(self._last_obs, dict)
@@ -393,10 +384,9 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
     ) -> bool:
         wrapper = self._rollout_env
         assert wrapper is not None and env is self.env
-        if self.progress > 0.0 and not self._restarted:
-            if self.policy_restart:
-                self.policy.restart(self.lr_schedule)
-            self._restarted = True
+        if self.policy_restart and self._past_warmup is False and self.progress > 0.0:
+            self.policy.restart(self.lr_schedule)
+        self._past_warmup = self.progress > 0.0
         wrapper.progress = self.progress
         if self.mismatch_hold_time is None:
             wrapper.redraw_mismatch()
