@@ -3,7 +3,7 @@
 from sb3_uspl import envs as envs  # registers the environments
 from sb3_uspl.baselines import RMA, PrivRecons, RESeLPolicy, RESeLPPO, RewReg
 from sb3_uspl.hidden import HiddenParameters
-from sb3_uspl.observations import PrivilegedObservation
+from sb3_uspl.observations import HidePrivileged, PrivilegedObservation
 from sb3_uspl.policies import CnnPolicy, DeploymentState, MlpPolicy, MultiInputPolicy, USPLPolicy
 from sb3_uspl.uspl_ppo import USPLPPO
 
@@ -15,6 +15,7 @@ __all__ = [
     "CnnPolicy",
     "DeploymentState",
     "HiddenParameters",
+    "HidePrivileged",
     "MlpPolicy",
     "MultiInputPolicy",
     "PrivRecons",

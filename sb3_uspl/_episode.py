@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -151,6 +152,6 @@ def run(command: str) -> bool:
         return False
     try:
         write(parse_arguments(command))
-    except ValueError as error:
+    except (ValueError, DependencyNotInstalled) as error:
         raise SystemExit(str(error)) from error
     return True

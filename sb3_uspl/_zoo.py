@@ -107,6 +107,8 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             try:
                 self.config = file.name
                 return super().read_hyperparameters()
+            except ValueError as error:
+                raise SystemExit(f"{given}: {str(error).replace(file.name, given)}") from error
             finally:
                 self.config = given
 
@@ -188,11 +190,12 @@ def _value_of(*names: str) -> str | None:
 
 def check_command_line() -> None:
     """
-    End with a message, rather than with the zoo's traceback, if the environment on the command line is unknown, the model that
-    is to be trained on is missing, or the tracker is not installed.
+    Have the command line say ``--algo uspl_ppo``, unless it names an algorithm, and end with a message, rather than with the
+    zoo's traceback, if its environment is unknown, the model that is to be trained on is missing, or the tracker is not
+    installed.
     """
-    packages = itertools.takewhile(lambda name: not name.startswith("-"), _after("--gym-packages"))
-    for package in packages:
+    _put_first("--algo", "uspl_ppo")
+    for package in _packages():
         importlib.import_module(package)
     env_id = _value_of("--env")
     if env_id:
@@ -215,6 +218,17 @@ def _is_installed(package: str) -> bool:
 
 def _after(name: str) -> list[str]:
     return sys.argv[sys.argv.index(name) + 1 :] if name in sys.argv else []
+
+
+def _packages() -> list[str]:
+    return list(itertools.takewhile(lambda name: not name.startswith("-"), _after("--gym-packages")))
+
+
+def drop_packages() -> None:
+    """Take ``--gym-packages``, which the zoo's recorder does not know, off the command line when they have been imported."""
+    if "--gym-packages" in sys.argv:
+        first = sys.argv.index("--gym-packages")
+        del sys.argv[first : first + 1 + len(_packages())]
 
 
 def use_default_folder() -> None:

@@ -5,6 +5,7 @@ import contextlib
 import json
 import os
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from sb3_uspl import _episode
 from sb3_uspl._agents import find_model, load_model
 from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, BulletVecEnv, check_names, register
 from sb3_uspl.evaluation import EVALUATION_SEED, evaluate
+from sb3_uspl.observations import PRIVILEGED
 
 
 def load_agent(
@@ -127,6 +129,11 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     model, venv = load_agent(
         arguments.algo, arguments.env, arguments.folder, arguments.exp_id, arguments.load_best, n_envs, env_kwargs
     )
+    if PRIVILEGED in getattr(model.observation_space, "spaces", ()) and arguments.algo not in ALGORITHMS:
+        warnings.warn(
+            f"This {arguments.algo} was trained with the privileged observation and is shown it: no deployment policy. "
+            "Train it on environments under sb3_uspl.HidePrivileged."
+        )
     with contextlib.closing(venv):
         if arguments.replay is not None:
             _episode.write_replay_page(model, venv, arguments)
@@ -137,12 +144,13 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
 def _print_table(result: dict[str, Any]) -> None:
     for name in ("deployment", "privileged"):
         prefix = "" if name == "deployment" else "privileged_"
-        if result[f"{prefix}success_rate"] is not None:
-            low, high = result[f"{prefix}success_interval"]
-            print(
-                f"{name:>10} policy: success {result[f'{prefix}success_rate']:.1%} (95 % interval {low:.1%} - {high:.1%}), "
-                f"return {result[f'{prefix}mean_return']:.2f}, length {result[f'{prefix}mean_length']:.1f} decisions"
-            )
+        if result[f"{prefix}mean_return"] is not None:
+            success = "success unknown, as the environment's info has no is_success"
+            if result[f"{prefix}success_rate"] is not None:
+                low, high = result[f"{prefix}success_interval"]
+                success = f"success {result[f'{prefix}success_rate']:.1%} (95 % interval {low:.1%} - {high:.1%})"
+            means = result[f"{prefix}mean_return"], result[f"{prefix}mean_length"]
+            print(f"{name:>10} policy: {success}, return {means[0]:.2f}, length {means[1]:.1f} decisions")
     if result["prediction_error_final"] is not None:
         print(f"prediction error at the end of an episode: {result['prediction_error_final']:.4f}")
     if result["divergence_mean"] is not None:

@@ -22,6 +22,8 @@ class EpisodeRecord:
 
     seed: int
     success: bool = False
+    success_is_known: bool = False
+    """Whether the environment says so in ``info["is_success"]``."""
     reward: float = 0.0
     positions: list[np.ndarray] = field(default_factory=list)
     """``info["position"]`` of the robot, or the common observation if the environment gives none."""
@@ -88,6 +90,7 @@ def run_episodes(
             for i in np.flatnonzero(alive).tolist():
                 wave[i].reward += float(rewards[i])
                 if starts[i]:
+                    wave[i].success_is_known = "is_success" in infos[i]
                     wave[i].success = bool(infos[i].get("is_success", False))
                     alive[i] = False
         records += wave[: n_episodes - first]
@@ -164,7 +167,7 @@ def evaluate(
     :param n_episodes: number of episodes, of each policy
     :param seed: seed of the first episode
     :param policy: "deployment", "privileged" or "both"; a model without a privileged policy is evaluated without it in "both"
-    :return: numbers by name, ready for JSON; what was not measured is None
+    :return: numbers by name, ready for JSON; None is what was not measured, and success where the environment does not say
     """
     if policy == "both" and not isinstance(model.policy, USPLPolicy):
         policy = "deployment"
@@ -175,10 +178,10 @@ def evaluate(
     }
     result: dict[str, Any] = {"episodes": n_episodes, "seed": seed}
     for name, prefix in (("deployment", ""), ("privileged", "privileged_")):
-        records = runs.get(name)
-        rate, low, high = success_rate(records) if records else (None, None, None)
+        records = runs.get(name, [])
+        rate, *interval = success_rate(records) if any(record.success_is_known for record in records) else (None,)
         result[f"{prefix}success_rate"] = rate
-        result[f"{prefix}success_interval"] = [low, high] if records else None
+        result[f"{prefix}success_interval"] = interval or None
         result[f"{prefix}mean_return"] = float(np.mean([r.reward for r in records])) if records else None
         result[f"{prefix}mean_length"] = float(np.mean([len(r) for r in records])) if records else None
     errors = [record.prediction_error for record in runs.get("deployment", []) if record.belief_mean]

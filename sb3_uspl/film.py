@@ -151,8 +151,19 @@ def map_of(env: gym.Env) -> BeliefInWorld:
     :param env: environment
     :return: its ``belief_in_world`` or its task's; without one, a belief is itself
     """
-    world: Any = env.unwrapped
-    return getattr(getattr(world, "task", world), "belief_in_world", lambda mean, std: (np.asarray(mean), np.asarray(std)))
+    place: BeliefInWorld | None = belief_in_world_of(env)
+    return place or (lambda mean, std: (np.asarray(mean), np.asarray(std)))
+
+
+def belief_in_world_of(env: gym.Env) -> BeliefInWorld | None:
+    """
+    :param env: environment
+    :return: ``belief_in_world`` of its task, of itself or of one of its wrappers; None if there is none
+    """
+    task = getattr(env.unwrapped, "task", None)
+    if hasattr(task, "belief_in_world"):
+        return task.belief_in_world  # type: ignore[no-any-return, union-attr]
+    return env.get_wrapper_attr("belief_in_world") if env.has_wrapper_attr("belief_in_world") else None
 
 
 def decision_period_of(env: gym.Env) -> float:
@@ -168,8 +179,11 @@ def _new_clip(env: gym.Env, seed: int, truth: np.ndarray, policy: str) -> Clip:
     task = getattr(world, "task", world)
     space: Any = env.observation_space
     goal = None
-    if hasattr(task, "belief_in_world"):
-        goal = np.asarray(task.goal if hasattr(task, "goal") else task.belief_in_world(truth, np.zeros_like(truth))[0])
+    belief_in_world = belief_in_world_of(env)
+    if belief_in_world is not None:
+        goal = np.asarray(task.goal if hasattr(task, "goal") else belief_in_world(truth, np.zeros_like(truth))[0])
+        if goal.shape[:1] < (2,):
+            raise ValueError(f"belief_in_world must return two arrays of at least two numbers, x and y in m; got {goal}.")
     choices = env.get_wrapper_attr("discrete_privileged") if env.has_wrapper_attr("discrete_privileged") else {}
     bounds = np.stack([space[PRIVILEGED].low, space[PRIVILEGED].high])
     return Clip(
@@ -178,6 +192,8 @@ def _new_clip(env: gym.Env, seed: int, truth: np.ndarray, policy: str) -> Clip:
 
 
 def _pose(world: Any, info: dict[str, Any], before: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
+    if "position" not in info:
+        raise ValueError('A film or replay needs info["position"], x and y in m, from reset and from every step.')
     x, y = map(float, info["position"][:2])
     if hasattr(world, "robot"):
         return x, y, world.robot.state.yaw

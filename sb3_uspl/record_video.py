@@ -5,7 +5,7 @@ import warnings
 
 from sb3_uspl import _episode
 from sb3_uspl._agents import check_agent
-from sb3_uspl._zoo import check_command_line, register, use_default_folder
+from sb3_uspl._zoo import check_command_line, drop_packages, register, use_default_folder
 
 if __name__ == "__main__":
     register()
@@ -15,5 +15,6 @@ if __name__ == "__main__":
         # The zoo loads the model with its one environment, as if to train it.
         warnings.filterwarnings("ignore", message=".*too few to give some a mismatched privileged observation")
         check_agent()
+        drop_packages()
         # The zoo's recorder is a script without a function to call.
         runpy.run_module("rl_zoo3.record_video", run_name="__main__", alter_sys=True)

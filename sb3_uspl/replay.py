@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Shape
-from sb3_uspl.film import Clip, record_clip
+from sb3_uspl.film import Clip, belief_in_world_of, decision_period_of, record_clip
 from sb3_uspl.pictures import DEPLOYMENT_COLOUR, SIGMA_COLOUR
 
 _CORNERS = 32
@@ -50,14 +50,14 @@ def write_replay(model: BaseAlgorithm, env: gym.Env, seed: int, out: Path, title
     except ImportError as error:
         raise ValueError('A replay needs plotly, which the extra brings: pip install -e ".[replay]".') from error
     world: Any = env.unwrapped
-    if not hasattr(getattr(world, "task", world), "belief_in_world"):
+    if belief_in_world_of(env) is None:
         raise ValueError(
             f"{world} has no belief_in_world(mean, std), which says where on its map a belief lies, so there is none to show."
         )
     noted = _Heights(env)
     clip = record_clip(model, noted, seed)
     title = title or f"{type(model).__name__}, seed {seed}"
-    data = page_data(clip, noted.heights, float(env.get_wrapper_attr("decision_period")))
+    data = page_data(clip, noted.heights, decision_period_of(env))
     template = string.Template(importlib.resources.files("sb3_uspl").joinpath("replay_page.html").read_text("utf-8"))
     # "</script>" in a text would end the script.
     text = json.dumps(data).replace("<", "\\u003c")

@@ -68,14 +68,14 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
     :param action_noise_timesteps: decisions after the warm-up over which that time constant falls to 0 along a cosine. PPO
         takes the noise for independent, and learns to fight it by jerks where precision is asked for.
     :param warmup_timesteps: decisions before blurring and reward transformation set in (l = 0; C.3.1: 100 epochs). None: 20 %
-        of the first ``learn``.
+        of ``total_timesteps`` of ``learn``, and kept when it goes on with ``reset_num_timesteps=False``.
     :param policy_warmup: whether actor and critic learn during the warm-up. Without it, the policy of the warm-up is an
         untrained one: the encoder learns from its strolls, and PPO meets blurring and reward transformation before it has
         learned to do without information.
     :param policy_restart: whether actor and critic start anew after the warm-up. What they learned there serves the encoder's
         experience; one that has learned to do without information may be too sure of itself to look for any.
-    :param ramp_timesteps: decisions over which the progress coefficient l rises to 1 (C.3.1: 300 epochs). None: 50 % of the
-        first ``learn``.
+    :param ramp_timesteps: decisions over which the progress coefficient l rises to 1 (C.3.1: 300 epochs). None: 50 % of
+        ``total_timesteps``, and kept likewise.
     :param blur: privileged blurring, Eq. 3 and 4
     :param reward_scaling: reward transformation, Eq. 2
     :param uncertainty_input: whether actor and critic see the uncertainty ("UI" in Table 2)

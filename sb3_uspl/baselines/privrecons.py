@@ -43,6 +43,7 @@ class PrivRecons(USPLPPO):
         self,
         policy: str | type[USPLPolicy],
         env: GymEnv | str,
+        *,
         blur: bool = False,
         reward_scaling: bool = False,
         uncertainty_input: bool = False,

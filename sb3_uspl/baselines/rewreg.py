@@ -99,6 +99,7 @@ class RewReg(RMA):
         self,
         policy: str | type[USPLPolicy],
         env: GymEnv | str,
+        *,
         penalty_weight: float = 0.1,
         divergence: str = "behaviour",
         _init_setup_model: bool = True,

@@ -26,6 +26,7 @@ class RMA(USPLPPO):
         self,
         policy: str | type[USPLPolicy],
         env: GymEnv | str,
+        *,
         blur: bool = False,
         reward_scaling: bool = False,
         uncertainty_input: bool = False,

@@ -41,6 +41,13 @@ def test_an_unknown_algorithm_is_told_what_there_is(command, tmp_path):
     assert "usppl" in message and "uspl_ppo" in message and "resel_ppo" in message
 
 
+def test_a_configuration_without_the_environment_is_named(tmp_path):
+    config = tmp_path / "mine.yml"
+    config.write_text("Other-v0: {n_envs: 2}\n")
+    message = refused("sb3_uspl.train", "--env", ENV, "-f", str(tmp_path), "-conf", str(config))
+    assert f"uspl_ppo-{ENV} in {config}" in message, "without --algo it is USPL"
+
+
 @pytest.mark.parametrize("command", READERS)
 def test_a_missing_agent_is_told_where_agents_lie(command, tmp_path):
     where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(tmp_path), *out(command, tmp_path))

@@ -44,6 +44,12 @@ OURS = (*ALGORITHMS, RESeLPPO)
 ANY = dict(n_steps=16, batch_size=32, n_epochs=2, seed=0)
 
 
+@pytest.mark.parametrize("algorithm", [RMA, RewReg, PrivRecons])
+def test_a_learning_rate_is_not_taken_for_something_else(algorithm):
+    with pytest.raises(TypeError, match="positional"):
+        algorithm("MlpPolicy", make_vec_env(ToyEnv, 4), 1e-3)
+
+
 @pytest.mark.parametrize("algorithm", OURS)
 def test_tensorboard_tells_the_algorithms_apart(algorithm, tmp_path):
     model = algorithm("MlpPolicy", make_vec_env(ToyEnv, 8), tensorboard_log=str(tmp_path), **ANY)

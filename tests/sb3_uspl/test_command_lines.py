@@ -136,7 +136,7 @@ def test_evaluation_shows_its_first_episode(logs, tmp_path):
 def test_record_video_writes_a_film(logs, tmp_path):
     pytest.importorskip("moviepy")
     where = ("--algo", "uspl_ppo", "--env", ENV, "-f", str(logs), "-o", str(tmp_path))
-    result = run("sb3_uspl.record_video", *where, "-n", "20")
+    result = run("sb3_uspl.record_video", *where, "--gym-packages", "sb3_uspl", "-n", "20")
     assert result.returncode == 0, result.stderr
     assert next(tmp_path.glob("*.mp4")).stat().st_size > 1000
 

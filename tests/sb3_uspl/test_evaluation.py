@@ -79,6 +79,16 @@ def test_positions_that_are_not_known_from_the_start_are_left_alone(model):
     np.testing.assert_allclose(np.stack(record.positions)[:, 0], [0.0, 1 / 2])  # the common observation's time
 
 
+def test_success_is_unknown_where_the_environment_does_not_say(model):
+    class Silent(ToyEnv):
+        def step(self, action):
+            return *super().step(action)[:4], {}
+
+    result = evaluate(model, make_vec_env(Silent, 2), 4)
+    assert result["success_rate"] is None and result["privileged_success_interval"] is None
+    assert result["mean_length"] == 8.0
+
+
 def test_it_agrees_with_sb3(model):
     venv = make_vec_env(ToyEnv, 5, seed=50)
     ours = run_episodes(model, venv, 5, seed=50)

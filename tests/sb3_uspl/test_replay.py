@@ -123,6 +123,36 @@ def test_an_environment_without_a_scene_and_one_with_a_camera(tmp_path):
     assert len(set(data["camera"])) == 6 and all(view.startswith("data:image/png;base64,") for view in data["camera"])
 
 
+class Placed(gym.Wrapper):
+    """Says where a belief lies, as a wrapper of one's own does, for an environment without a decision period."""
+
+    where, axes = True, 2
+
+    def reset(self, **kwargs):
+        obs, info = self.env.reset(**kwargs)
+        return obs, info | ({"position": (0.0, 0.0)} if self.where else {})
+
+    def step(self, action):
+        *result, info = self.env.step(action)
+        return *result, info | ({"position": (1.0, 0.0)} if self.where else {})
+
+    def belief_in_world(self, mean, std):
+        return np.resize(mean, self.axes), np.resize(std, self.axes)
+
+
+def test_a_wrappers_map_is_taken_and_what_it_needs_is_named(tmp_path, monkeypatch):
+    monkeypatch.delattr(ToyEnv, "decision_period")
+    env = Placed(ToyEnv())
+    model = tiny(env)
+    clip = write_replay(model, env, 1, tmp_path / "page.html")
+    assert clip.goal.tolist() == [clip.truth[0]] * 2 and len(clip.poses) > 2
+    for name, value, message in (("axes", 1, "at least two numbers"), ("where", False, "position")):
+        monkeypatch.setattr(Placed, name, value)
+        with pytest.raises(ValueError, match=message):
+            write_replay(model, env, 1, tmp_path / "page.html")
+        monkeypatch.undo()
+
+
 def test_what_cannot_be_replayed_is_refused(tmp_path, monkeypatch):
     env = ToyEnv()
     model = tiny(env)
