@@ -315,6 +315,9 @@ class _Stage:
         (left, bottom), (right, top) = corners[:, 0].min(axis=0) - _MARGIN, corners[:, 1].max(axis=0) + _MARGIN
         if shapes and not self.clip.goal_is_place:
             (left, bottom), (right, top) = self._where_it_happens(goal)
+        elif not shapes:
+            low, high = self._where_it_happens(goal)
+            (left, bottom), (right, top) = np.minimum((left, bottom), low), np.maximum((right, top), high)
         axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x" + unit, ylabel="y" + unit)
         self.size = right - left
         self.belief = Ellipse((0.0, 0.0), 1.0, 1.0, facecolor=SIGMA_COLOUR, edgecolor=SIGMA_COLOUR, alpha=0.55, linewidth=2.0)
