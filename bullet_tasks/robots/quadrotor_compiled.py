@@ -31,7 +31,7 @@ class CompiledQuadrotor(Quadrotor):
     def substep(self) -> QuadrotorState:
         """Let 1/50 s pass (see base class)."""
         kernels.advance(self._flight, self._command, self._body, _NO_ENDS, kernels.NOT_HOVERING, 1)
-        self.state = state_of(self._flight, self._floor)
+        self.state = self._measured()
         return self.state
 
     def advance(self, n_substeps: int, judge: Judge) -> Stretch:
@@ -46,8 +46,11 @@ class CompiledQuadrotor(Quadrotor):
         done, contacts, code, judge.since = kernels.advance(
             self._flight, self._command, self._body, judge.limits, judge.since, n_substeps
         )
-        self.state = state_of(self._flight, self._floor)
+        self.state = self._measured()
         return Stretch(done, contacts, OUTCOMES[code])
+
+    def _measured(self) -> QuadrotorState:
+        return state_of(self._flight, self._floor)
 
     def appear(self, simulation: Simulation) -> None:
         """

@@ -1,6 +1,5 @@
 """The compiled quadruped with another body in every episode, for policies that are to walk on legs, or on a real robot."""
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +7,8 @@ import numpy as np
 from bullet_tasks import kernels
 from bullet_tasks.robots.compiled_quadruped import CompiledQuadruped
 from bullet_tasks.robots.quadruped_body import QuadrupedCommand
+from bullet_tasks.robots.variation import Range, check_variation
 from bullet_tasks.world import World
-
-_Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -29,23 +27,16 @@ class Variation:
     :raises ValueError: if a range is empty or not positive, or an error negative
     """
 
-    radius: _Range = (0.20, 0.25)
-    max_yaw_rate: _Range = (1.7, 2.1)
-    yaw_gain: _Range = (5.0, 9.0)
-    yaw_acceleration: _Range = (10.0, 60.0)
-    speed: _Range = (0.95, 1.05)
+    radius: Range = (0.20, 0.25)
+    max_yaw_rate: Range = (1.7, 2.1)
+    yaw_gain: Range = (5.0, 9.0)
+    yaw_acceleration: Range = (10.0, 60.0)
+    speed: Range = (0.95, 1.05)
     heading_error: float = 0.1
     pitch_error: float = 0.02
 
     def __post_init__(self) -> None:
-        ranges = dataclasses.asdict(self)
-        for name in ("heading_error", "pitch_error"):
-            error = ranges.pop(name)
-            if not error >= 0.0:
-                raise ValueError(f"`{name}` must be 0 or more rad, got {error}.")
-        for name, (least, greatest) in ranges.items():
-            if not 0.0 < least <= greatest:
-                raise ValueError(f"`{name}` must be a range of positive numbers, (least, greatest), got {(least, greatest)}.")
+        check_variation(self)
 
 
 class VariedQuadruped(CompiledQuadruped):

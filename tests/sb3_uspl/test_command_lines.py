@@ -12,6 +12,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from torch import nn
 
@@ -84,6 +85,16 @@ def test_every_algorithm_trains_and_is_evaluated(algo, tmp_path):
     result = run("sb3_uspl.evaluate", "--algo", algo, *arguments)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["algo"] == algo
+
+
+def test_evaluation_warns_of_an_sb3_policy_that_sees_the_answer(tmp_path):
+    folder = tmp_path / "ppo" / f"{ENV}_1"
+    folder.mkdir(parents=True)
+    PPO("MultiInputPolicy", gym.make(ENV), n_steps=64).save(folder / f"{ENV}.zip")
+    arguments = ("--env", ENV, "-f", str(tmp_path), "--episodes", "2", "--n-envs", "2", "--json")
+    with pytest.warns(UserWarning, match="is shown it: no deployment policy"):
+        result = run("sb3_uspl.evaluate", "--algo", "ppo", *arguments)
+    assert result.returncode == 0, result.stderr
 
 
 def test_training_is_continued_where_it_ended(logs, tmp_path):
