@@ -6,6 +6,7 @@ What a trained agent comes to know before it acts, and how much success it has w
 
 import argparse
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -29,7 +30,8 @@ Observation = dict[str, np.ndarray]
 
 def signpost(obs: Observation) -> np.ndarray:
     """Whether each robot has the signpost in sight, ``(n_envs, 1)``."""
-    return (obs["target"] < -_ABOVE_FEET).any(axis=1, keepdims=True)
+    in_sight: np.ndarray = np.any(obs["target"] < -_ABOVE_FEET, axis=1, keepdims=True)
+    return in_sight
 
 
 def corners(obs: Observation) -> np.ndarray:
@@ -75,15 +77,15 @@ def watch(
     :return: what each episode has shown at any time, ``(n_envs, n)``; successes and lengths, ``(n_envs,)``
     """
     venv.seed(EVALUATION_SEED)
-    obs, state = venv.reset(), None
-    assert isinstance(obs, dict)
+    obs: Any = venv.reset()
+    state: tuple[np.ndarray, ...] | None = None
     ever = np.zeros_like(shows(obs))
     success, length = np.zeros(venv.num_envs, bool), np.zeros(venv.num_envs, int)
     starts, alive = np.ones(venv.num_envs, bool), np.ones(venv.num_envs, bool)
     while alive.any():
         ever[alive] |= shows(obs)[alive]
-        actions, state = model.predict(obs, state, starts, deterministic=True)  # type: ignore[arg-type]
-        obs, _, starts, infos = venv.step(actions)  # type: ignore[assignment]
+        actions, state = model.predict(obs, state, starts, deterministic=True)
+        obs, _, starts, infos = venv.step(actions)
         length[alive] += 1
         for i in np.flatnonzero(alive & starts):
             success[i] = infos[i]["is_success"]

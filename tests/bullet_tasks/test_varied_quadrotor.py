@@ -1,4 +1,4 @@
-"""Laws of a varied quadrotor: an episode is its seed, no two fly or land alike, and without variation it is the compiled body."""
+"""Laws of a varied quadrotor: an episode is its seed, no two land alike, and without variation it is the compiled body."""
 
 import gymnasium
 import numpy as np
