@@ -2,7 +2,6 @@
 
 import math
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -97,29 +96,3 @@ def test_commands_are_off_by_no_more_than_the_error(world, name, error):
         reached.append(robot.state.yaw - 0.5 if name == "heading_error" else robot.state.pitch - 0.1)
     assert np.abs(reached).max() <= error + 1e-3
     assert np.std(reached) == pytest.approx(error / math.sqrt(3.0), rel=0.3, abs=1e-3)
-
-
-def test_tasks_are_the_same_with_it():
-    varied, compiled = (gymnasium.make("SquareMaze-v0", physics=physics) for physics in ("varied", "compiled"))
-    for seed in range(5):
-        (seen, _), (reference, _) = varied.reset(seed=seed), compiled.reset(seed=seed)
-        assert {key: value.tolist() for key, value in seen.items()} == {
-            key: value.tolist() for key, value in reference.items()
-        }
-    assert varied.observation_space == compiled.observation_space and varied.action_space == compiled.action_space
-    varied.close()
-    compiled.close()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (dict(radius=(0.25, 0.2)), "`radius` must be a range of positive numbers"),
-        (dict(speed=(0.0, 1.0)), "`speed` must be a range of positive numbers"),
-        (dict(heading_error=-0.1), "`heading_error` must be 0 or more"),
-        (dict(pitch_error=-0.1), "`pitch_error` must be 0 or more"),
-    ],
-)
-def test_impossible_variations_are_refused(arguments, words):
-    with pytest.raises(ValueError, match=words):
-        Variation(**arguments)
