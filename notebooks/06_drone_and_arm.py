@@ -206,8 +206,8 @@ for label, shift in (("just before the ground", -1), ("1 s after touch-down", 5)
 
 # %% [markdown]
 # Only the altitude's σ falls before the ground is reached: whoever is still flying at a small *reading* has excluded the biases with
-# which that would be underground. (There the encoder is too sure: its error is larger than its σ.) Roll and pitch become known at
-# the touch, all at once, and the σ that is shown follows within a second (it is smoothed, App. C.3.1).
+# which that would be underground. (There the encoder is a little too sure: its error is as large as its σ.) Roll and pitch become
+# known at the touch, all at once, and the σ that is shown follows within a second (it is smoothed, App. C.3.1).
 #
 # ## The uncertainty set by hand (Fig. 7)
 #
