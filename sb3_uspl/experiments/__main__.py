@@ -114,17 +114,23 @@ def _show(
     folder = given.output / given.budget
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{experiment.name}.csv", plan, cells, results)
+    at_end = "at the training's end"
+    model = at_end
+    if given.model == "best" or experiment.kind in RECORDED:
+        model = "with the highest reward in the training's own evaluations"
     figures, picture = Figures(plan, results, given.model), folder / f"{experiment.name}.png"
     if experiment.kind in TABLE_KINDS:
         summaries = collect(experiment, cells, results, given.seeds, given.model)
-        body = [markdown(plan, experiment, summaries, missing), "", NOTES[experiment.kind]]
+        last = None
+        if experiment.kind == "success" and given.model != "last":
+            last = collect(experiment, cells, results, given.seeds, "last")
+            model += f' ("last": {at_end})'
+        body = [markdown(plan, experiment, summaries, missing, last), "", NOTES[experiment.kind]]
         drawn = figures.bars(experiment, summaries, picture)
     else:
         drawn = figures.draw(experiment, cells, picture)
         body = [f"No such task yet: {env}." for env in missing]
     unrun = [cell for cell in cells if not results.has(cell)]
-    best = given.model == "best" or experiment.kind in RECORDED
-    model = "with the highest reward in the training's own evaluations" if best else "at the training's end"
     text = [
         f"# {experiment.title}",
         "",

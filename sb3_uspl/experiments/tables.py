@@ -19,25 +19,33 @@ NOTES = {
         "Only cells that ran on the same machine with as many others beside them can be compared: see the CSV."
     ),
 }
+Summaries = Mapping[tuple[str, str], Summary]
+"""By environment and column."""
 
 
 def markdown(
-    plan: Plan, experiment: Experiment, summaries: Mapping[tuple[str, str], Summary], missing: Sequence[str] = ()
+    plan: Plan, experiment: Experiment, summaries: Summaries, missing: Sequence[str] = (), last: Summaries | None = None
 ) -> str:
     """
     :param plan: for the labels
     :param experiment: table
-    :param summaries: by environment and column
+    :param summaries: of our numbers
     :param missing: environments of the experiment that do not exist (yet)
-    :return: table, one row an environment for our numbers and one for the paper's
+    :param last: of the models at the trainings' ends, if the other numbers are not theirs
+    :return: table, of every environment a row for our numbers, one for the last models' and one for the paper's
     """
+    ours = {"ours": summaries} | ({"ours, last": last} if last is not None else {})
     envs = list(dict.fromkeys(env for env, _ in summaries))
     rows = [["", "", *(plan.label(column) for column in experiment.columns)], ["---"] * (2 + len(experiment.columns))]
     for env in envs:
-        rows.append([env, "ours", *(_ours(summaries[env, column], experiment.kind) for column in experiment.columns)])
+        for name, those in ours.items():
+            values = [_ours(those[env, column], experiment.kind) for column in experiment.columns]
+            rows.append([env if name == "ours" else "", name, *values])
         rows.append(["", "paper", *(_paper(experiment, env, column) for column in experiment.columns)])
     if experiment.average and len(envs) > 1:
-        rows.append(["average", "ours", *(_average(envs, summaries, column) for column in experiment.columns)])
+        for name, those in ours.items():
+            averages = [_average(envs, those, column) for column in experiment.columns]
+            rows.append(["average" if name == "ours" else "", name, *averages])
         complete = set(envs) == set(experiment.envs)
         paper = [_paper(experiment, AVERAGE, column) if complete else "" for column in experiment.columns]
         rows.append(["", "paper" if complete else "paper: other rows", *paper])
@@ -68,7 +76,7 @@ def _paper(experiment: Experiment, env: str, column: str) -> str:
     return "" if value is None else str(value).replace("±", " ± ")
 
 
-def _average(envs: Sequence[str], summaries: Mapping[tuple[str, str], Summary], column: str) -> str:
+def _average(envs: Sequence[str], summaries: Summaries, column: str) -> str:
     """Over tasks, of those that are complete; the interval is stratified by task."""
     cells = [summaries[env, column] for env in envs]
     if any(not cell.values for cell in cells):

@@ -95,7 +95,11 @@ def test_a_table_beside_the_papers_numbers(plan, tmp_path):
     assert ours["RMA"] == "50.0<br>1 of 2 seeds" and ours["RMA-p"] == "90.0<br>1 of 2 seeds"
     assert ours["RewReg"] == "not run" and paper["RewReg"] == "49.5 ± 0.6"
     assert lines[-1].startswith("| Nowhere-v0 | no such task yet")
-    assert collect(experiment, cells, results, (1, 2), "last")["ActiveTMaze-v0", "uspl"].mean == 0.0
+    last = collect(experiment, cells, results, (1, 2), "last")
+    assert last["ActiveTMaze-v0", "uspl"].mean == 0.0
+    with_last = markdown(plan, experiment, summaries, ["Nowhere-v0"], last).splitlines()
+    assert [*with_last[:3], *with_last[4:]] == lines
+    assert with_last[3].startswith("|  | ours, last | not run |") and " 0.0 ± 0.0<br>0.0 (0.0-0.0) " in with_last[3]
 
     write_csv(tmp_path / "t.csv", plan, cells, results)
     rows = list(csv.DictReader((tmp_path / "t.csv").open()))
