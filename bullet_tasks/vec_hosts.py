@@ -10,6 +10,7 @@ from typing import Any, NoReturn, Protocol
 
 import gymnasium
 
+from bullet_tasks.adaptive_wait import AdaptiveWait
 from bullet_tasks.vec_worker import CLOSE, EnvFns, EnvHost, Reply, Request, run_worker
 
 _LIVENESS_PERIOD = 1.0  # s between two looks at whether a silent worker still lives
@@ -92,6 +93,7 @@ class HostInWorker:
     def __init__(self, context: Any, connections: Sequence[Connection], env_fns: EnvFns, first: int, name: str) -> None:
         self.owes_reply = True
         self.connection, there = context.Pipe()
+        self._wait = AdaptiveWait(self.connection).wait
         inherited = (*connections, self.connection) if context.get_start_method() == "fork" else ()
         arguments = (there, inherited, env_fns, first)
         self.process = context.Process(target=run_worker, args=arguments, name=name, daemon=True)
@@ -110,7 +112,7 @@ class HostInWorker:
     def receive(self) -> Reply:
         """See :class:`Host`."""
         try:
-            while not self.connection.poll(_LIVENESS_PERIOD):
+            while not self._wait(_LIVENESS_PERIOD):
                 # A reply sent just before the end still counts, hence the second look.
                 if not self.process.is_alive() and not self.connection.poll(0):
                     self._bury()

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from bullet_tasks.adaptive_wait import AdaptiveWait
 from bullet_tasks.infos import PackedInfos, pack
 from bullet_tasks.shared_arrays import Layout, SharedArrays
 
@@ -242,7 +243,9 @@ def run_worker(connection: Connection, inherited: Sequence[Connection], env_fns:
         except Exception as error:
             connection.send(_failure(error))
             return
+        wait = AdaptiveWait(connection).wait
         while True:
+            wait(None)
             request = connection.recv()
             if request[0] == CLOSE:
                 return
