@@ -19,7 +19,7 @@ from bullet_tasks import ENV_IDS
 
 PHYSICS = ("kinematic", "compiled")
 """Of those kinds that train; a task that knows neither is measured as it comes."""
-ONE, TWO, DUMMY, SUBPROC = start_up.VEC_ENVS
+ONE, TWO, _, SUBPROC = start_up.VEC_ENVS
 MANY = {"compiled": 256}
 """Environments of a training, by kind of physics; 64 of the others, which have 30 MB each in PyBullet."""
 WORKERS_TARGET, SUBPROC_TARGET = 1.7, 3.0
@@ -212,7 +212,7 @@ def run(
 
     :param repetitions: rounds of every comparison
     :param n_envs: number of environments
-    :param n_many: of environments, without SubprocVecEnv; None: as many as in a training, see ``MANY``
+    :param n_many: of environments, of BulletVecEnv alone; None: as many as in a training, see ``MANY``
     :param n_steps: decisions per environment and repetition, half of that with many
     :param n_resets: resets per repetition
     :param env_ids: tasks
@@ -229,8 +229,9 @@ def run(
             table += rows(values, f"{env_id}, {variant}, {n_envs} envs", "decisions / s", SUBPROC)
             gains.setdefault((f"{variant}, {n_envs} envs", SUBPROC, SUBPROC_TARGET), []).append(ratio(values, TWO, SUBPROC))
             gains.setdefault((f"{variant}, {n_envs} envs", ONE, WORKERS_TARGET), []).append(ratio(values, TWO, ONE))
-            many = n_many or MANY.get(variant, 64)  # SubprocVecEnv would need a process for each
-            values = throughput(env_id, env_kwargs, many, n_steps // 2, repetitions, [ONE, TWO, DUMMY])
+            # SubprocVecEnv would need a process for each, and all contenders' clients at once a machine's memory.
+            many = n_many or MANY.get(variant, 64)
+            values = throughput(env_id, env_kwargs, many, n_steps // 2, repetitions, [ONE, TWO])
             table += rows(values, f"{env_id}, {variant}, {many} envs", "decisions / s", ONE)
             gains.setdefault((f"{variant}, {many} envs", ONE, WORKERS_TARGET), []).append(ratio(values, TWO, ONE))
     targets = []
