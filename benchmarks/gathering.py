@@ -5,19 +5,19 @@ What a trained agent comes to know before it acts, and how much success it has w
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from benchmarks.harness import Row, show
 from bullet_tasks.tasks.midpoint_choice import MidpointChoiceConfig
 from sb3_uspl._zoo import register
 from sb3_uspl.evaluate import load_agent
-from sb3_uspl.evaluation import EVALUATION_SEED
+from sb3_uspl.evaluation import EpisodeRecord, run_episodes, success_rate
 
 _ABOVE_FEET = 0.05  # m; what stands higher than this in Signpost Nav is the signpost
 _AT_A_CORNER = 1.7  # m from the goal there: the columns before it are within the scandots' reach, 1.2 m
@@ -65,55 +65,53 @@ TASKS: dict[str, tuple[Callable[[Observation], np.ndarray], Callable[[np.ndarray
 """Environment -> what an observation shows, and what all that an episode has shown is called."""
 
 
-def watch(
-    model: BaseAlgorithm, venv: VecEnv, shows: Callable[[Observation], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class Watch(VecEnvWrapper):
     """
-    Run one episode in every environment, deterministic actions.
+    Remembers what the first episode of every environment has shown.
 
-    :param model: trained model
     :param venv: environments
     :param shows: what an observation shows, ``(n_envs, n)``
-    :return: what each episode has shown at any time, ``(n_envs, n)``; successes and lengths, ``(n_envs,)``
     """
-    venv.seed(EVALUATION_SEED)
-    obs: Any = venv.reset()
-    state: tuple[np.ndarray, ...] | None = None
-    ever = np.zeros_like(shows(obs))
-    success, length = np.zeros(venv.num_envs, bool), np.zeros(venv.num_envs, int)
-    starts, alive = np.ones(venv.num_envs, bool), np.ones(venv.num_envs, bool)
-    while alive.any():
-        ever[alive] |= shows(obs)[alive]
-        actions, state = model.predict(obs, state, starts, deterministic=True)
-        obs, _, starts, infos = venv.step(actions)
-        length[alive] += 1
-        for i in np.flatnonzero(alive & starts):
-            success[i] = infos[i]["is_success"]
-        alive &= ~starts
-    return ever, success, length
+
+    def __init__(self, venv: VecEnv, shows: Callable[[Observation], np.ndarray]) -> None:
+        super().__init__(venv)
+        self._shows = shows
+        self.ever = np.zeros((venv.num_envs, 0), dtype=bool)
+        """What each episode has shown at any time, ``(n_envs, n)``."""
+        self._alive = np.ones(venv.num_envs, dtype=bool)
+
+    def reset(self) -> Any:
+        """Begin to watch (see base class)."""
+        obs: Any = self.venv.reset()
+        self.ever, self._alive[:] = self._shows(obs), True
+        return obs
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Watch what still runs (see base class)."""
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self._alive &= ~dones
+        self.ever[self._alive] |= self._shows(obs)[self._alive]  # type: ignore[arg-type]
+        return obs, rewards, dones, infos
 
 
-def table(names: list[str], success: np.ndarray, length: np.ndarray) -> list[Row]:
+def table(names: Sequence[str], records: Sequence[EpisodeRecord]) -> list[Row]:
     """
     Success by what was gathered.
 
     :param names: of what each episode has gathered
-    :param success: ``(n_episodes,)``
-    :param length: ``(n_episodes,)``
+    :param records: the episodes
     :return: a row for each name, and one for all episodes
     """
-    rows: list[Row] = []
-    labels = np.array(names)
-    for name, among in [(name, labels == name) for name in sorted(set(names))] + [("all", np.ones(len(labels), bool))]:
-        rows.append(
-            {
-                "gathered": name,
-                "episodes": int(among.sum()),
-                "success": float(success[among].mean()),
-                "decisions": float(length[among].mean()),
-            }
-        )
-    return rows
+    groups = {name: [record for record, its in zip(records, names, strict=True) if its == name] for name in sorted(set(names))}
+    return [
+        {
+            "gathered": name,
+            "episodes": len(among),
+            "success": success_rate(among)[0],
+            "decisions": float(np.mean([len(record) for record in among])),
+        }
+        for name, among in [*groups.items(), ("all", records)]
+    ]
 
 
 def main() -> None:
@@ -131,9 +129,10 @@ def main() -> None:
     register()
     shows, name = TASKS[given.env]
     model, venv = load_agent(given.algo, given.env, given.folder, 0, given.load_best, given.episodes, {"physics": "compiled"})
-    ever, success, length = watch(model, venv, shows)
-    venv.close()
-    print(show(f"{given.algo}, {given.env}", table([name(row) for row in ever], success, length)))
+    watched = Watch(venv, shows)
+    records = run_episodes(model, watched, given.episodes)
+    watched.close()
+    print(show(f"{given.algo}, {given.env}", table([name(row) for row in watched.ever], records)))
 
 
 if __name__ == "__main__":

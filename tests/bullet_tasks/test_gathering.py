@@ -6,7 +6,8 @@ from scripted_policies import SignReader, towards
 from scripted_stacking import Guess, Oracle, Weigh, WeighWithoutGreen
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.gathering import TASKS, table, watch
+from benchmarks.gathering import TASKS, Watch, table
+from sb3_uspl.evaluation import EpisodeRecord, run_episodes
 
 N = 12
 
@@ -17,6 +18,8 @@ class Scripted:
     def __init__(self, make):
         self.scripts = [make() for _ in range(N)]
 
+    policy = None  # no USPLPolicy: only `predict` is used
+
     def predict(self, obs, state, starts, deterministic):
         rows = [{key: value[i] for key, value in obs.items()} for i in range(N)]
         return np.stack([script(row) for script, row in zip(self.scripts, rows, strict=True)]), state
@@ -26,10 +29,10 @@ def gathered(env_id, make):
     shows, name = TASKS[env_id]
     venv = make_vec_env(env_id, N, env_kwargs={"physics": "compiled"})
     points = venv.envs[0].unwrapped.sensors[0].points if venv.envs[0].unwrapped.sensors else None
-    ever, success, length = watch(Scripted(lambda: make(points)), venv, shows)
-    venv.close()
-    assert length.min() >= 1
-    return [name(row) for row in ever], success
+    watched = Watch(venv, shows)
+    records = run_episodes(Scripted(lambda: make(points)), watched, N)
+    watched.close()
+    return [name(row) for row in watched.ever], np.array([record.success for record in records])
 
 
 def test_who_reads_the_signpost_has_seen_it():
@@ -75,7 +78,9 @@ def test_cubes_are_those_that_were_weighed(make, names):
 
 
 def test_success_by_what_was_gathered():
-    rows = table(["seen", "not seen", "seen", "seen"], np.array([True, False, False, True]), np.array([4, 9, 1, 1]))
+    episodes = [(True, 4), (False, 9), (False, 1), (True, 1)]
+    records = [EpisodeRecord(0, success, positions=[np.zeros(2)] * length) for success, length in episodes]
+    rows = table(["seen", "not seen", "seen", "seen"], records)
     assert rows == [
         {"gathered": "not seen", "episodes": 1, "success": 0.0, "decisions": 9.0},
         {"gathered": "seen", "episodes": 3, "success": 2 / 3, "decisions": 2.0},
