@@ -6,7 +6,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_uspl.encoder.recurrence import PackedGRU
+from sb3_uspl.encoder.recurrence import CompiledGRU
 
 MemoryState = tuple[th.Tensor, ...]
 """What a memory carries from one decision to the next; every tensor has the environments as its first axis."""
@@ -123,18 +123,8 @@ class GRUMemory(Memory):
 
     def _on_cpu(self, features: th.Tensor, lengths: th.Tensor) -> th.Tensor:
         input_weight, hidden_weight, input_bias, hidden_bias = self.gru.parameters()
-        # Token by time, the longest sequences first, as torch's PackedSequence has them.
-        lengths, order = th.sort(lengths, descending=True)
-        mask = token_mask(lengths).t()
-        starts = features.new_zeros(len(lengths), dtype=th.long)
-        starts[order] = lengths
-        starts = (starts.cumsum(0) - starts)[order]
-        by_time = (starts + th.arange(len(mask))[:, None])[mask]
-        back = th.empty_like(by_time)
-        back[by_time] = th.arange(len(by_time))
-        gates = F.linear(features.index_select(0, by_time), input_weight, input_bias)
-        hidden = PackedGRU.apply(gates, hidden_weight, hidden_bias, mask.sum(1).tolist())
-        return hidden.index_select(0, back)
+        gates = F.linear(features, input_weight, input_bias)
+        return CompiledGRU.apply(gates, hidden_weight, hidden_bias, lengths)
 
     def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
         outputs, hidden = self.gru(features[:, None], state[0][None].contiguous())

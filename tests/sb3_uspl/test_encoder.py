@@ -90,18 +90,25 @@ def test_no_tokens_leave_the_initial_state(name):
     assert len(outputs) == 0 and all((part == 0).all() and len(part) == 2 for part in state)
 
 
-def test_the_compiled_recurrence_is_torchs_gru():
-    """Outputs and all gradients, on sequences of any lengths."""
-    memory, lengths = make_memory("gru"), [5, 9, 1, 9]
-    features = th.randn(sum(lengths), 16, requires_grad=True)
-    weights = th.randn(sum(lengths), 16)
+@pytest.mark.parametrize("width", [16, 7])
+@pytest.mark.parametrize("scale", [1.0, 30.0], ids=["usual", "saturated"])
+def test_the_compiled_recurrence_is_torchs_gru(width, scale):
+    """Outputs, state and all gradients, on sequences of any lengths."""
+    th.manual_seed(0)
+    memory, lengths = MEMORIES["gru"](width), [5, 0, 9, 1, 9, 0]
+    features = scale * th.randn(sum(lengths), width)
+    features.requires_grad = True
+    weights = th.randn(sum(lengths), width)
     inputs = [features, *memory.parameters()]
-    ours = memory(features, th.tensor(lengths))[0]
-    reference = th.cat([memory.gru(part[None])[0][0] for part in features.split(lengths)])
-    th.testing.assert_close(ours, reference, atol=1e-6, rtol=1e-5)
+    ours, (state,) = memory(features, th.tensor(lengths))
+    parts = [memory.gru(part[None])[0][0] for part in features.split(lengths) if len(part)]
+    reference = th.cat(parts)
+    th.testing.assert_close(ours, reference, atol=2e-6, rtol=1e-5)
+    th.testing.assert_close(state[[0, 2, 3, 4]], th.stack([part[-1] for part in parts]), atol=2e-6, rtol=1e-5)
+    assert (state[[1, 5]] == 0.0).all()
     gradients = [th.autograd.grad((outputs * weights).sum(), inputs) for outputs in (ours, reference)]
     for mine, theirs in zip(*gradients, strict=True):
-        th.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+        th.testing.assert_close(mine, theirs, atol=scale * 1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", MEMORIES)
