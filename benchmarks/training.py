@@ -7,12 +7,14 @@ the encoder only, and PPO's minibatches are so many fewer. Plain PPO sees the pr
 
 import contextlib
 import functools
+import inspect
 import math
 import statistics
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from benchmarks.contenders import (
@@ -56,6 +58,8 @@ TASKS = (
     # A repetition lasts as long as one of its episodes.
     Task("ActiveTMaze-v0", {}, 32),
 )
+DEFAULT_TASKS = TASKS[1:]
+"""Learned with the libraries' defaults, too. With more environments an iteration of RecurrentPPO takes minutes."""
 IMAGE_TASKS = (Task("SignpostNavDepth-v0", {"physics": "compiled"}),)
 """Broken down by phase only: minutes an iteration in methods that keep images in PPO's buffers."""
 RECURRENT_TARGET, RMA_TARGET, ROLLOUT_TARGET, SPEED_TARGET = 10.0, 1.1, 1.5, 10_000.0
@@ -70,6 +74,7 @@ QUICK: dict[str, Any] = dict(
     repetitions=1,
     tasks=(Task("LateralChoice-v0", {"physics": "compiled"}, 32),),
     decisions=512,
+    default_tasks=(),
     image_tasks=(),
     rollout_envs=8,
     env_counts=(32, 64),
@@ -89,6 +94,17 @@ def settings_for(task: Task, n_envs: int | None = None, decisions: int | None = 
     entry = zoo_entry("uspl_ppo", task.env_id)
     n_steps = (decisions or entry["n_envs"] * entry["n_steps"]) // (n_envs or task.n_envs)
     return {**zoo_settings("uspl_ppo", task.env_id), **ALL_AT_ONCE, "n_steps": n_steps, **replacements}
+
+
+def default_settings(n_envs: int, decisions: int | None = None) -> Settings:
+    """
+    Nothing of the zoo's: a library's own defaults, but rollouts as long as RecurrentPPO's for all of them.
+
+    :param n_envs: number of environments
+    :param decisions: of an iteration, in all environments; None takes RecurrentPPO's number of steps
+    """
+    n_steps = inspect.signature(RecurrentPPO).parameters["n_steps"].default if decisions is None else decisions // n_envs
+    return {**ALL_AT_ONCE, "n_steps": n_steps}
 
 
 @contextlib.contextmanager
@@ -147,19 +163,19 @@ def samples_per_second(model: OnPolicyAlgorithm, threads: int = 1, iterations: i
 
 
 def compare_methods(
-    task: Task, decisions: int | None = None, threads: int = 1, repetitions: int = 5, methods: Sequence[str] = METHODS
+    task: Task, settings: Settings, threads: int = 1, repetitions: int = 5, methods: Sequence[str] = METHODS
 ) -> dict[str, list[float]]:
     """
     Samples per second of every method.
 
     :param task: to learn
-    :param decisions: of an iteration, in all environments; None takes the zoo's
+    :param settings: of USPL; the others have what they know of them
     :param threads: of torch
     :param repetitions: rounds
     :param methods: to compare
     :return: values by method
     """
-    settings, contenders = settings_for(task, decisions=decisions), {}
+    contenders = {}
     cycle = iterations_per_episode(task, settings["n_steps"])
     with contextlib.ExitStack() as stack:
         for method in methods:
@@ -264,6 +280,7 @@ def run(
     env_counts: Sequence[int] = (128, 256),
     thread_counts: Sequence[int] = (1, 2),
     threads: int = 1,
+    default_tasks: Sequence[Task] = DEFAULT_TASKS,
     image_tasks: Sequence[Task] = IMAGE_TASKS,
 ) -> Tables:
     """
@@ -276,6 +293,7 @@ def run(
     :param env_counts: numbers of environments for :func:`end_to_end`
     :param thread_counts: threads of torch for :func:`end_to_end`; the most of them to compare the methods
     :param threads: of torch for everything else; phases of updates that run side by side cannot be told apart
+    :param default_tasks: tasks that USPL and RecurrentPPO also learn with :func:`default_settings`
     :param image_tasks: further tasks, broken down by phase only
     """
     methods: list[Row] = []
@@ -283,8 +301,9 @@ def run(
     rollouts: list[Row] = []
     targets: list[Row] = []
     for task in tasks:
-        width = memory_width(settings_for(task))
-        values = compare_methods(task, decisions, max(thread_counts), repetitions)
+        settings = settings_for(task, decisions=decisions)
+        width = memory_width(settings)
+        values = compare_methods(task, settings, max(thread_counts), repetitions)
         methods += rows(values, f"{task}, {task.n_envs} envs, memory of {width}", "samples / s", "RecurrentPPO")
         targets += [
             target(f"{task}: samples/s of USPL / RecurrentPPO", ratio(values, "USPLPPO", "RecurrentPPO"), RECURRENT_TARGET),
@@ -295,6 +314,14 @@ def run(
         rollouts += rows(values, f"{task}, {rollout_envs} envs", "s / rollout", "PPO")
         measured = ratio(values, "USPLPPO", "PPO")
         targets.append(target(f"{task}: time of a rollout, USPL / PPO", measured, at_most=ROLLOUT_TARGET))
+    for task in default_tasks:
+        settings = default_settings(task.n_envs, decisions)
+        values = compare_methods(task, settings, max(thread_counts), repetitions, ("USPLPPO", "RecurrentPPO"))
+        what = f"{task}, {task.n_envs} envs, the libraries' defaults, memory of {memory_width(settings)}"
+        methods += rows(values, what, "samples / s", "RecurrentPPO")
+        measured = ratio(values, "USPLPPO", "RecurrentPPO")
+        what = f"{task}, the libraries' defaults: samples/s of USPL / RecurrentPPO"
+        targets.append(target(what, measured, RECURRENT_TARGET))
     for task in image_tasks:
         phases += breakdown(task, decisions, threads, repetitions)
     values = end_to_end(tasks[0], env_counts, thread_counts, decisions, repetitions)

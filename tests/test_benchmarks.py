@@ -256,7 +256,8 @@ def test_training(monkeypatch):
     monkeypatch.setattr(training, "ALL_AT_ONCE", {**training.ALL_AT_ONCE, **short})
     seeing = [training.Task("SignpostNavDepth-v0", {"physics": "compiled"}, 8)]
     quick = dict(rollout_envs=8, env_counts=(8,), thread_counts=(1,))
-    tables = training.run(1, [LATERAL_CHOICE], ONE_EPISODE, **quick, image_tasks=seeing)
+    few = [LATERAL_CHOICE]
+    tables = training.run(1, few, ONE_EPISODE, **quick, default_tasks=few, image_tasks=seeing)
     speed, by_phase, rollouts, whole, targets = tables.values()
     check_table(speed, "samples / s")
     assert {row["contender"] for row in speed} == set(METHODS)
@@ -266,7 +267,7 @@ def test_training(monkeypatch):
         assert len(shares) == len(phases.PHASES) and sum(shares) == pytest.approx(1.0)
     check_table(rollouts, "s / rollout")
     check_table(whole, "decisions / s")
-    assert len(targets) == 4
+    assert len(targets) == 5
 
 
 def test_iterations_cover_an_episode():
