@@ -6,9 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch as th
-from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,7 +20,7 @@ from bullet_tasks.vec_env import BulletVecEnv
 from sb3_uspl import RMA, USPLPPO, RESeLPPO
 from sb3_uspl._configs import CONFIGS, load_entries
 from sb3_uspl.encoder import PRESETS
-from sb3_uspl.observations import PRIVILEGED
+from sb3_uspl.observations import HidePrivileged
 
 _NOT_FOR_THE_MODEL = ("policy", "n_envs", "n_timesteps", "env_kwargs")
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "normalize", "frame_stack")
@@ -31,26 +29,6 @@ _NET_ARCH = [128, 128]
 
 Settings = dict[str, Any]
 """Arguments of a model."""
-
-
-class HidePrivileged(gym.ObservationWrapper):
-    """
-    Leaves out the privileged observation, for a method that would read it at deployment too.
-
-    :param env: environment under the observation contract
-    """
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        assert isinstance(env.observation_space, spaces.Dict)
-        self.observation_space = spaces.Dict({k: v for k, v in env.observation_space.items() if k != PRIVILEGED})
-
-    def observation(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """
-        :param observation: of the wrapped environment
-        :return: the same without the privileged part
-        """
-        return {key: value for key, value in observation.items() if key != PRIVILEGED}
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:

@@ -1,10 +1,12 @@
 """Small PyBullet worlds in which a robot must gather information before it acts; importing registers them with gymnasium."""
 
+import importlib
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
+from bullet_tasks.env import RobotTaskEnv
 from bullet_tasks.tasks.biased_quadrotor import BiasedQuadrotor
 from bullet_tasks.tasks.blind_mass_stack import BlindMassStack
 from bullet_tasks.tasks.lateral_choice import LateralChoice
@@ -31,6 +33,8 @@ _TASKS: dict[str, type[Any]] = {
 ENV_IDS = tuple(_TASKS)
 
 for _env_id, _task_class in _TASKS.items():
+    # Where it may ask a class for its render modes, "rgb_array_list" and the like work.
+    importlib.import_module(_task_class.__module__).make_env.metadata = RobotTaskEnv.metadata
     gymnasium.register(
         id=_env_id,
         entry_point=f"{_task_class.__module__}:make_env",

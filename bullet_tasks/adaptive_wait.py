@@ -1,6 +1,9 @@
 """Waiting for a message from another process, without sleeping where it is about to come."""
 
+import functools
+import select
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 SOON = 3e-4
@@ -17,6 +20,7 @@ class AdaptiveWait:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self._is_there = _glance(connection)
         self._came_soon = True
 
     def wait(self, timeout: float | None) -> bool:
@@ -28,8 +32,17 @@ class AdaptiveWait:
         """
         began = time.perf_counter()
         while self._came_soon and time.perf_counter() - began < SOON:
-            if self._connection.poll(0):
+            if self._is_there():
                 return True
         there = self._connection.poll(timeout)
         self._came_soon = there and time.perf_counter() - began < SOON
         return there
+
+
+def _glance(connection: Connection) -> Callable[[], object]:
+    """What tells at once whether there is a message; ``Connection.poll`` makes a selector each time, ten times as slow."""
+    if not hasattr(select, "poll"):
+        return functools.partial(connection.poll, 0)
+    poller = select.poll()
+    poller.register(connection.fileno(), select.POLLIN)
+    return functools.partial(poller.poll, 0)

@@ -121,6 +121,8 @@ class RobotTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         for sensor in self.sensors:
             sensor.reset(scene, self.np_random)
         self._elapsed_substeps = 0
+        if self.render_mode == "human":
+            self.robot.appear(self.world.simulation)
         info = {"is_success": False, "position": np.array(state.position, dtype=np.float32)}
         return self._observation(), info
 

@@ -13,7 +13,7 @@ import numpy as np
 
 X, Y, COS, SIN, HALF_X, HALF_Y, BOTTOM, TOP, ROUND, SOLID, FLOOR = range(11)
 """
-Columns of a scene's array, one row a shape: centre (m), direction of the shape's x axis, half edges or twice the radius (m),
+Columns of a scene's array, one row a shape: centre (m), direction of the shape's x axis, half edges or the radius twice (m),
 heights of the lower and the upper face (m); 1 or 0 for: a cylinder, others collide with it, its top carries a robot.
 """
 N_COLUMNS = 11

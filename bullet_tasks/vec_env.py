@@ -40,7 +40,8 @@ class BulletVecEnv(VecEnv):
         make_vec_env("LateralChoice-v0", n_envs=32, vec_env_cls=BulletVecEnv, vec_env_kwargs={"n_workers": 2})
 
     An error in ``step`` or ``reset`` of an environment is raised here with the worker's traceback as its cause, and closes
-    the vector environment. After a KeyboardInterrupt it can be used again; the interrupted step is lost.
+    the vector environment. After a KeyboardInterrupt it can be used again; the interrupted step is lost. A second
+    one is not put off until this process has done its part of the step, which may never be.
 
     :param env_fns: functions that make the environments
     :param n_workers: number of processes at work, this one included; by default one a core that this process may use, at

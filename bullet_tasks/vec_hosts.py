@@ -1,11 +1,13 @@
 """How ``BulletVecEnv`` reaches the hosts of its environments: one lives in this process, each other one in a worker."""
 
+import _signal  # what `signal` wraps to name handlers by enumerations, which takes 25 us a step
 import contextlib
 import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
+from types import FrameType
 from typing import Any, NoReturn, Protocol
 
 import gymnasium
@@ -103,11 +105,13 @@ class HostInWorker:
 
     def post(self, request: Request) -> None:
         """See :class:`Host`."""
-        try:
-            self.connection.send(request)
-        except OSError:
-            self._bury()
-        self.owes_reply = True
+        message = pickle.dumps(request)  # `send` prepares a pickler of its own each time
+        with _interrupts_deferred():
+            try:
+                self.connection.send_bytes(message)
+            except OSError:
+                self._bury()
+            self.owes_reply = True
 
     def receive(self) -> Reply:
         """See :class:`Host`."""
@@ -116,10 +120,11 @@ class HostInWorker:
                 # A reply sent just before the end still counts, hence the second look.
                 if not self.process.is_alive() and not self.connection.poll(0):
                     self._bury()
-            reply = self.connection.recv_bytes()
+            with _interrupts_deferred():
+                reply = self.connection.recv_bytes()
+                self.owes_reply = False
         except (EOFError, OSError):
             self._bury()
-        self.owes_reply = False
         return pickle.loads(reply)
 
     def _bury(self) -> NoReturn:
@@ -129,7 +134,7 @@ class HostInWorker:
     def hang_up(self) -> None:
         """See :class:`Host`."""
         with contextlib.suppress(OSError, ValueError):
-            self.connection.send((CLOSE, ()))
+            self.connection.send_bytes(pickle.dumps((CLOSE, ())))
         # Frees a worker that waits for room to send a reply that nobody will read.
         self.connection.close()
 
@@ -147,15 +152,27 @@ class HostInWorker:
 
 @contextlib.contextmanager
 def _interrupts_deferred() -> Iterator[None]:
-    """A KeyboardInterrupt would leave a world in the middle of a step: it comes at the end of this context."""
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is None:
+    """
+    A KeyboardInterrupt would leave a world in the middle of a step, or a message half read: it comes at the end of this
+    context. A second one comes at once, for what never ends.
+    """
+    former = _signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(former):
         yield  # only the main thread is interrupted, and a handler that is not Python's could not be put back
         return
-    pending = []
-    former = signal.signal(signal.SIGINT, lambda number, frame: pending.append(number))
+    pending: list[int] = []
+
+    def defer(number: int, frame: FrameType | None) -> None:
+        if pending:
+            pending.clear()
+            former(number, frame)
+        else:
+            pending.append(number)
+
+    _signal.signal(signal.SIGINT, defer)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, former)
+        _signal.signal(signal.SIGINT, former)
         if pending:
             signal.raise_signal(signal.SIGINT)

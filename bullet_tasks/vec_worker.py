@@ -89,7 +89,7 @@ class EnvHost:
         try:
             return True, getattr(self, method)(*arguments)
         except Exception as error:
-            return _failure(error)
+            return False, (error, traceback.format_exc())
 
     def env_spaces(self) -> list[tuple[spaces.Space, spaces.Space]]:
         """Observation and action space of every environment."""
@@ -212,14 +212,16 @@ def _is_wrapped(env: gymnasium.Env, wrapper_class: type[gymnasium.Wrapper]) -> b
     return False
 
 
-def _failure(error: BaseException) -> Reply:
-    """A reply that tells of an error; the error itself comes along if it survives the way."""
-    text = traceback.format_exc()
+def _pickled(reply: Reply) -> bytes:
+    """A reply for another process: of what does not survive the way, the error that says so, or the traceback alone."""
+    succeeded, result = reply
     try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return False, (None, text)
-    return False, (error, text)
+        message = pickle.dumps(reply)
+        if not succeeded:
+            pickle.loads(message)
+        return message
+    except Exception as error:
+        return _pickled((False, (error, traceback.format_exc()))) if succeeded else pickle.dumps((False, (None, result[1])))
 
 
 def run_worker(connection: Connection, inherited: Sequence[Connection], env_fns: EnvFns, first: int) -> None:
@@ -241,20 +243,15 @@ def run_worker(connection: Connection, inherited: Sequence[Connection], env_fns:
             host = EnvHost(env_fns.env_fns, first)
             connection.send((True, host.env_spaces()))
         except Exception as error:
-            connection.send(_failure(error))
+            connection.send_bytes(_pickled((False, (error, traceback.format_exc()))))
             return
         wait = AdaptiveWait(connection).wait
         while True:
             wait(None)
-            request = connection.recv()
+            request = pickle.loads(connection.recv_bytes())
             if request[0] == CLOSE:
                 return
-            try:
-                reply = pickle.dumps(host.serve(request))
-            except Exception as error:
-                # The result does not survive the way.
-                reply = pickle.dumps(_failure(error))
-            connection.send_bytes(reply)
+            connection.send_bytes(_pickled(host.serve(request)))
     except (EOFError, OSError):
         # The parent is gone or has hung up.
         return

@@ -104,7 +104,7 @@ class WrappedExperience(PPO, Generic[WrapperT]):
         fresh = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         # SB3 does it after a rollout, too late for what depends on it in the first one.
-        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        self._update_current_progress_remaining(self.num_timesteps, max(1, self._total_timesteps))
         wrapper, env = self._rollout_env, self.env
         assert env is not None
         if wrapper is None or wrapper.venv is not env or wrapper.encoder is not self.policy.encoder:

@@ -21,6 +21,7 @@ from sb3_uspl.observations import (
     TARGET,
     TRUTH,
     policy_observation_space,
+    stored_space,
 )
 from sb3_uspl.symmetries import SymmetryGroup
 
@@ -73,7 +74,8 @@ class EpisodeReplayBuffer:
     """
     Whole episodes for the encoder: those running, those that ended in this iteration, and a replay of older ones.
 
-    The replay keeps the observations in their own dtype, once, within a budget of bytes; the oldest episodes go first.
+    The replay keeps images in their own dtype and numbers as float32, once, within a budget of bytes; the oldest episodes go
+    first.
 
     :param observation_space: the environment's observation space (the contract)
     :param n_action: number of encoded action values
@@ -114,7 +116,8 @@ class EpisodeReplayBuffer:
             TRUTH: (_shape(observation_space[PRIVILEGED]), np.float32),
         }
         if TARGET in observation_space.spaces:
-            self._spec[TARGET] = (_shape(observation_space[TARGET]), observation_space[TARGET].dtype)  # type: ignore[assignment]
+            target = stored_space(observation_space[TARGET])
+            self._spec[TARGET] = (target.shape, target.dtype)
         self.telltale = False
         """Whether matched policies act on the plain truth now, so that their behaviour gives it away."""
         self.replay: deque[Episode] = deque()
@@ -131,6 +134,7 @@ class EpisodeReplayBuffer:
             key: np.zeros((self.n_envs, self._capacity, *shape), dtype) for key, (shape, dtype) in self._spec.items()
         }
         self.lengths = np.zeros(self.n_envs, dtype=np.int64)
+        self._rows = np.arange(self.n_envs)
 
     def add(self, obs: dict[str, np.ndarray]) -> None:
         """
@@ -140,16 +144,10 @@ class EpisodeReplayBuffer:
         """
         step = obs[EPISODE_STEP]
         self.close_ended(step)
-        # A callback that stops training skips a decision; what is left of such an episode has a gap and is not used.
-        whole = step == self.lengths
-        self.lengths[~whole] = 0
-        rows = np.flatnonzero(whole)
-        if len(rows) == 0:
-            return
-        self._grow(int(step[rows].max()) + 1)
+        self._grow(int(step.max()) + 1)
         for key, array in self.running.items():
-            array[rows, step[rows]] = obs[key][rows]
-        self.lengths[rows] += 1
+            array[self._rows, step] = obs[key]
+        self.lengths += 1
 
     def close_ended(self, step: np.ndarray) -> None:
         """

@@ -40,6 +40,17 @@ def is_image(space: spaces.Space) -> bool:
     return is_image_space(space) or (space.dtype == np.float16 and space.is_bounded() and bool((space.low < space.high).all()))
 
 
+def stored_space(space: spaces.Space) -> spaces.Box:
+    """
+    How observations are kept in buffers: images as they are, numbers as float32, also whole ones, of which ``VecNormalize``
+    makes fractions without a change of their space.
+
+    :param space: of one key of the contract
+    """
+    assert isinstance(space, spaces.Box)
+    return space if is_image(space) else spaces.Box(-np.inf, np.inf, space.shape, np.float32)
+
+
 def check_observation_space(space: spaces.Space) -> spaces.Dict:
     """
     Check that a space follows the observation contract.
@@ -127,15 +138,13 @@ def policy_observation_space(space: spaces.Dict) -> spaces.Dict:
     :param space: the environment's observation space (the contract)
     :return: space with the keys ``POLICY_KEYS``
     """
-    privileged = space[PRIVILEGED]
-    assert isinstance(privileged, spaces.Box) and isinstance(space[COMMON], spaces.Box)
-    unbounded = spaces.Box(-np.inf, np.inf, privileged.shape, np.float32)
+    unbounded = stored_space(space[PRIVILEGED])
     return spaces.Dict(
         {
-            COMMON: space[COMMON],
+            COMMON: stored_space(space[COMMON]),
             PRIVILEGED: unbounded,
             TRUTH: unbounded,
-            UNCERTAINTY: spaces.Box(0.0, 1.0, privileged.shape, np.float32),
+            UNCERTAINTY: spaces.Box(0.0, 1.0, unbounded.shape, np.float32),
             BELIEF: unbounded,
         }
     )
@@ -189,6 +198,13 @@ class PrivilegedObservation(gym.ObservationWrapper):
                 f"part once, out of {available}."
             )
         common = [name for name in available if name not in named]
+        for part in (common, hidden, only_encoder):
+            wide = [name for name in part if isinstance(space, spaces.Dict) and len(space[name].shape or ()) != 1]
+            if wide and (len(part) > 1 or part is not only_encoder):
+                raise ValueError(
+                    f"{wide} have another number of axes than one: only an image can be, and only as the one part that the "
+                    f"encoder alone sees, target=[{wide[0]!r}]."
+                )
         if not common:
             raise ValueError("Every part of the observation is privileged or target; at least one must stay common.")
         self._parts: dict[str, list[Any]] = {COMMON: common, PRIVILEGED: hidden}

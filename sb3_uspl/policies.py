@@ -248,11 +248,12 @@ class USPLPolicy(ContractPolicy):
 
         :param lr_schedule: learning rate of actor and critic
         """
+        device = self.device  # of the first parameter, which is a new one below
         with self.without_encoder():
             self._build(lr_schedule)
+            self.to(device)
             if self.initial_action is not None:
                 self._begin_with(self.initial_action)
-        self.to(self.device)
 
     def predict(  # type: ignore[override]
         self,

@@ -277,7 +277,7 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
         self.symmetries = _arguments.ask_symmetries(self.env, self.symmetries)
         self._check_arguments()
         # A model that was trained is loaded with any number of environments, be it to evaluate it in one.
-        loaded = self.num_timesteps > 0
+        loaded = self._replay_is_lost = self.num_timesteps > 0
         self.n_mismatched = _arguments.count_mismatched(self, lenient=loaded)
         period = self.decision_period = _arguments.ask_decision_period(self.env, self.decision_period)
         self.encoder_lr_schedule = falling(self.encoder_learning_rate, self.encoder_learning_rate_floor)
@@ -344,8 +344,8 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
     def _prepare(self, total_timesteps: int, reset_num_timesteps: bool) -> None:
         if self.num_timesteps > 0:
             _arguments.count_mismatched(self)  # more strictly than when it was loaded
-        if not len(self._episodes.replay):
-            self._replay_is_lost = not reset_num_timesteps and self.num_timesteps > 0
+        if reset_num_timesteps:
+            self._replay_is_lost = False
         warmup, ramp = int(0.2 * total_timesteps), int(0.5 * total_timesteps)
         if self._progress_period is not None and not reset_num_timesteps:
             warmup, ramp = self._progress_period

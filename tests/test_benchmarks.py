@@ -2,14 +2,13 @@
 
 import json
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 
 from benchmarks import __main__ as command_line
 from benchmarks import encoder, environments, gpu, growth, harness, phases, start_up, to_success, training
-from benchmarks.contenders import METHODS, HidePrivileged, build, hides_privileged, make_venv, memory_width, zoo_settings
+from benchmarks.contenders import METHODS, build, hides_privileged, make_venv, memory_width, zoo_settings
 from benchmarks.synthetic import SyntheticEnv
 from sb3_uspl import USPLPPO
 from sb3_uspl.encoder import MEMORIES
@@ -140,13 +139,6 @@ def test_every_phase_of_an_iteration_is_seen():
 
 
 # -- contenders --------------------------------------------------------------------------------------------------------------
-
-
-def test_privileged_observation_is_hidden():
-    env = HidePrivileged(gym.make("LateralChoice-v0", physics="compiled"))
-    observation, _ = env.reset(seed=0)
-    assert set(observation) == set(env.observation_space.spaces) == {"common"}
-    env.close()
 
 
 def test_contenders_have_the_same_sizes_and_settings():

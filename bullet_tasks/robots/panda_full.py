@@ -26,7 +26,7 @@ from bullet_tasks.simulation import Simulation
 from bullet_tasks.world import World
 
 SUBSTEP = 1.0 / 60.0
-"""s; the largest at which stacks of cubes and the arm are stable (``pybullet_facts``: 5 of 5 at 60 Hz)."""
+"""s; the largest at which stacks of cubes and the arm are stable (five of five at 60 Hz)."""
 GRAVITY = 9.81
 """m/s^2"""
 SPEED = 0.6

@@ -33,7 +33,7 @@ _FOOT_FRICTION = 2.0  # times that of floors, which is PyBullet's 0.5: 1.0, the 
 _BODY_FRICTION = 0.2  # the trunk slides along walls
 _PLACED_ABOVE = 0.002  # m
 _AWAY = 1000.0  # m
-_OTHER_BODY, _LINK, _NORMAL_FORCE = 2, 3, 9  # fields of a record of getContactPoints
+_OTHER_BODY, _NORMAL_FORCE = 2, 9  # fields of a record of getContactPoints
 _HALF_TURN = math.pi + 1e-6  # rad; beyond it a heading is nearer the other way round
 
 

@@ -129,7 +129,7 @@ class Intrinsics:
 
 
 RELEASE = Intrinsics.from_field_of_view(106, 42, math.radians(87.0)).cropped(left=4, right=4, bottom=2).resized(87, 58)
-"""The authors' release's camera: 106 x 42 pixels, cropped, resized to 87 x 58 (facts, section 4.1). The resizing is bicubic
+"""The authors' release's camera: 106 x 42 pixels, cropped, resized to 87 x 58. The resizing is bicubic
 there; here the pixels are cast as they are."""
 
 SMALL = RELEASE.resized(48, 36)

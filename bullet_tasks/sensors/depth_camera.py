@@ -55,7 +55,7 @@ class DepthCamera(Sensor):
     robot nor what only guides the eye, such as a goal's marker. A camera within a shape sees black, except with PyBullet's
     renderers, which look through a wall that is closer than 1 cm.
 
-    Defaults are the authors' release's camera (facts, section 4.1), but for its random pitch of +-1 degree.
+    Defaults are the authors' release's camera, but for its random pitch of +-1 degree.
 
     :param intrinsics: size of the images and directions of their pixels
     :param position: of the camera in the frame of the body that carries it (forward, left, up), m

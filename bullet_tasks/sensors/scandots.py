@@ -25,7 +25,7 @@ class Scandots(Sensor):
     where nothing is. The numbers are of the order of one, so they are not scaled. Points are ordered by their forward
     coordinate, then by their sideways one, both ascending.
 
-    Defaults are the authors' release's: 12 x 11 points (facts, section 4.1). Unlike there, terrain is exact instead of a grid
+    Defaults are the authors' release's: 12 x 11 points. Unlike there, terrain is exact instead of a grid
     of 5 cm cells, and every reading is of the moment; the release renews them every 0.1 s.
 
     :param forward: least and greatest forward coordinate, m

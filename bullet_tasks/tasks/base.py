@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -82,15 +82,6 @@ class Task(ABC):
         :param action: numbers in the action space
         :param state: of the robot, now
         """
-
-    @final
-    def outcome(self, state: RobotState) -> Outcome:
-        """
-        Judge the robot after a substep.
-
-        :param state: of the robot
-        """
-        return self.judge(state)
 
     @abstractmethod
     def reward_terms(self, state: RobotState, contact_time: float, time_left: float, outcome: Outcome) -> dict[str, float]:

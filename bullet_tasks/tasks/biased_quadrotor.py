@@ -166,8 +166,9 @@ class BiasedQuadrotor(Task):
         the altitude error.
 
     Rewards
-        ``altitude`` 0.5 exp(-error / 0.5 m) and ``level`` 0.5 exp(-tilt / 0.15 rad) per s, of the true values; ``low`` -1.5
-        per s below a true altitude of 0.3 m; ``success`` 8 + 12 * (fraction of the time left); ``crash`` -6.
+        ``altitude`` 0.5 exp(-error / 0.5 m) and ``level`` 0.5 exp(-tilt / 0.15 rad) per s, of the true values (those of a
+        varied body shake on the ground); ``low`` -1.5 per s below a true altitude of 0.3 m; ``success`` 8 + 12 * (fraction of
+        the time left); ``crash`` -6.
 
     Success
         For 1 s on end, within 0.15 m of the true altitude 1.5 m and within 0.05 rad of true level in roll and in pitch.
@@ -178,7 +179,7 @@ class BiasedQuadrotor(Task):
 
     Optimal behaviour
         Without the privileged observation: sink slowly, land, read the biases off, climb and hover by the corrected
-        readings, which takes 5.6 s on average and up to 7.5 s. Whoever trusts the sensors hovers in the wrong place.
+        readings; a simple script needs 5.6 s on average and up to 7.5 s. Whoever trusts the sensors hovers in the wrong place.
 
     Differences from the paper
         The paper gives no numbers; all of them are ours. Decisions every 0.2 s instead of 20 ms, 60 an episode. Success ends

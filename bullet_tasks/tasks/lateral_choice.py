@@ -28,7 +28,7 @@ _MARKER_HALF_HEIGHT = 0.01  # m; the goal's disc lies on the floor
 @dataclass(frozen=True)
 class LateralChoiceConfig:
     """
-    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release (facts, section 4.5).
+    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release.
 
     :param corridor_half_width: the floor's half-width; beyond it is a drop
     :param drop: height of the floor above the ground beside it

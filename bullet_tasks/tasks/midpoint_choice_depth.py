@@ -11,7 +11,7 @@ from bullet_tasks.tasks.midpoint_choice import MidpointChoice, MidpointChoiceCon
 from bullet_tasks.tasks.seeing import make_seeing_env
 
 LARGE = MidpointChoiceConfig(half_side=2.55, corner=2.45, column_near=2.34, column_far=2.70, column_outer=1.06)
-"""The platform of the release's task with images (facts, section 4.4)."""
+"""The platform of the release's task with images."""
 
 
 class MidpointChoiceDepth(MidpointChoice):

@@ -28,7 +28,7 @@ _MARGIN = 0.1  # m; a robot is that far beyond a floor's edge at most before it 
 @dataclass(frozen=True)
 class NavigationReward:
     """
-    Reward weights, the same for all tasks of the authors' release (facts, section 4.2).
+    Reward weights, the same for all tasks of the authors' release.
 
     :param goal_progress: per m by which the distance to the goal decreases
     :param heading_progress: per rad by which the absolute heading error to the goal decreases

@@ -31,7 +31,7 @@ _BLOCKS = ("post_near", "post_middle", "post_far")
 @dataclass(frozen=True)
 class SignpostNavConfig:
     """
-    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release (facts, section 4.3).
+    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release.
 
     :param platform_radius: of the disc; beyond it is a drop
     :param drop: height of the disc above the ground beside it

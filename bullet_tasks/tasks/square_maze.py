@@ -33,7 +33,7 @@ _POCKETS = {"south": (0.0, -1.0), "east": (1.0, 0.0), "west": (-1.0, 0.0)}
 @dataclass(frozen=True)
 class SquareMazeConfig:
     """
-    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release (facts, section 4.6).
+    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release.
 
     :param road_half_width: half of the width between two curbs
     :param arm: distance from the middle of the maze to the start of the trunk, to the middle lines of the side roads, and

@@ -36,7 +36,7 @@ _SIDES = {"left": 1.0, "right": -1.0}
 @dataclass(frozen=True)
 class StairwaySearchConfig:
     """
-    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release (facts, section 4.7).
+    Sizes, times and weights; lengths in m, times in s. Geometry of the authors' release.
 
     :param half_side: of the square platform
     :param corner: x and y of the middle of a corner platform, up to their signs

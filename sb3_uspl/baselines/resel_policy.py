@@ -39,7 +39,7 @@ class RESeLPolicy(ContractPolicy):
     :param net_arch: layers of actor and critic, as in SB3
     :param activation_fn: their activation (ELU in the paper)
     :param encoder: preset of the encoder, "small" or "paper" (App. C.3.3)
-    :param memory: the encoder's memory, "transformer" or "gru"
+    :param memory: the encoder's memory, "transformer", "gru" or "max"
     :param encoder_kwargs: replaces single entries of the preset
     :param privileged_gain: factor that brings privileged values to unit scale
     :param normalize_common: as for ``USPLPolicy``

@@ -14,7 +14,7 @@ from torch import nn
 
 from sb3_uspl._experience import ExperienceVecWrapper
 from sb3_uspl.encoder import MemoryState, ObservationEncoder, Tokens, encode_actions, reset_rows
-from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_finite
+from sb3_uspl.observations import COMMON, PREVIOUS_ACTION, PRIVILEGED, check_finite, stored_space
 
 EMBEDDING = "embedding"
 """Key of the memory's output, which the actor sees in the place of USPL's belief."""
@@ -59,10 +59,10 @@ class HistoryEncoder(nn.Module):
     def forward(self, tokens: Tokens, lengths: th.Tensor) -> tuple[th.Tensor, MemoryState]:
         """
         :param tokens: encoder inputs of whole sequences, one after another, ``(n_tokens, ...)``
-        :param lengths: lengths of the sequences, ``(n_sequences,)``; 0 is allowed, but not for all
+        :param lengths: lengths of the sequences, ``(n_sequences,)``; 0 is allowed
         :return: embeddings ``(n_tokens, width)`` and the memory after each sequence's last token
         """
-        remembered, state = self.memory(self.features(tokens), lengths)
+        remembered, state = self.memory(self.features.in_parts(tokens), lengths)
         return self.embedding(remembered), state
 
     def step(self, tokens: Tokens, state: MemoryState) -> tuple[th.Tensor, MemoryState]:
@@ -106,9 +106,7 @@ class HistoryVecWrapper(ExperienceVecWrapper):
         :param lengths: number of past tokens of each environment, ``(n_envs,)``
         :return: current observation for the policy
         """
-        self.memory = self.encoder.memory.initial_state(self.num_envs)
-        if lengths.any():
-            _, self.memory = self.encoder(tokens, lengths)
+        _, self.memory = self.encoder(tokens, lengths)
         return self._observe(self._obs)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -153,8 +151,8 @@ class SequenceRolloutBuffer(DictRolloutBuffer):
         **kwargs: Any,
     ):
         previous_action = spaces.Box(-np.inf, np.inf, (get_flattened_obs_dim(action_space),), np.float32)
-        stored = spaces.Dict({**observation_space.spaces, PREVIOUS_ACTION: previous_action})
-        super().__init__(buffer_size, stored, action_space, **kwargs)
+        stored = {key: stored_space(part) for key, part in observation_space.items()}
+        super().__init__(buffer_size, spaces.Dict({**stored, PREVIOUS_ACTION: previous_action}), action_space, **kwargs)
         self.context_length = context_length
         self.forget_running()
 

@@ -1,4 +1,4 @@
-"""Observation encoder: features (MLP, CNN), memory (GRU, Transformer with KV cache), belief head (mean, std)."""
+"""Observation encoder: features (MLP, CNN), memory (GRU, Transformer with KV cache, maximum), belief head (mean, std)."""
 
 from sb3_uspl.encoder.encoder import (
     MAX_STD,
@@ -11,7 +11,16 @@ from sb3_uspl.encoder.encoder import (
     soft_clamp,
 )
 from sb3_uspl.encoder.features import FourierFeatures, ImageCNN, RunningNormalizer, TokenFeatures, Tokens, encode_actions
-from sb3_uspl.encoder.memory import MEMORIES, GRUMemory, Memory, MemoryState, TransformerMemory, reset_rows, take_rows
+from sb3_uspl.encoder.memory import (
+    MEMORIES,
+    GRUMemory,
+    MaxMemory,
+    Memory,
+    MemoryState,
+    TransformerMemory,
+    reset_rows,
+    take_rows,
+)
 
 __all__ = [
     "MAX_STD",
@@ -23,6 +32,7 @@ __all__ = [
     "FourierFeatures",
     "GRUMemory",
     "ImageCNN",
+    "MaxMemory",
     "Memory",
     "MemoryState",
     "ObservationEncoder",

@@ -65,9 +65,6 @@ common observation if the target is an image (None: ``hidden``), the image's ``c
 discrete dimensions is ``categorical`` (see ``DiscreteHead``), and ``memory_kwargs`` by the memory's name.
 """
 
-IMAGE_TOKENS = 2048
-"""Without gradients, long sequences of images go through the CNN in parts of this size, for the memory that it takes."""
-
 MIN_STD, MAX_STD = 0.005, 1.0
 """Range of the predicted standard deviation (release: log-std softly clamped to [ln 0.005, 0])."""
 
@@ -203,12 +200,18 @@ class ObservationEncoder(nn.Module):
                 f"encoder_kwargs has unknown entries {sorted(unknown)}; it may replace {sorted(PRESETS[preset])}."
             )
         sizes = {**PRESETS[preset], **(overrides or {})}
+        unknown = set(sizes["memory_kwargs"]) - set(MEMORIES)
+        if unknown:
+            raise ValueError(
+                f"memory_kwargs has unknown entries {sorted(unknown)}; they go by the memory's name, e.g. "
+                "memory_kwargs={'transformer': {'n_heads': 8}}."
+            )
         n_privileged = space[PRIVILEGED].shape[0]  # type: ignore[index]
         sees = TARGET in space.spaces and is_image(space[TARGET])
         self.features = TokenFeatures(
             space,
             n_action,
-            (sees and sizes["hidden_beside_image"]) or sizes["hidden"],
+            sizes["hidden_beside_image" if sees and sizes["hidden_beside_image"] is not None else "hidden"],
             sizes["trunk"],
             sizes["frequencies"],
             sizes["convolutions"],
@@ -256,14 +259,8 @@ class ObservationEncoder(nn.Module):
         :param lengths: of the episodes, ``(n_episodes,)``
         :return: beliefs ``(n_tokens, n_privileged)`` and the memory after each episode's last token
         """
-        memory, state = self.memory(self._features(tokens), lengths)
+        memory, state = self.memory(self.features.in_parts(tokens), lengths)
         return self._belief(memory), state
-
-    def _features(self, tokens: Tokens) -> th.Tensor:
-        if th.is_grad_enabled() or not self.features.has_image:
-            return self.features(tokens)
-        parts = zip(*(tensor.split(IMAGE_TOKENS) for tensor in tokens.values()), strict=True)
-        return th.cat([self.features(dict(zip(tokens, part, strict=True))) for part in parts])
 
     def step(self, tokens: Tokens, state: MemoryState, longest: int | None = None) -> tuple[Belief, MemoryState]:
         """

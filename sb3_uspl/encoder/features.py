@@ -121,6 +121,9 @@ class FourierFeatures(nn.Module):
         return th.cat([x, *[f(angle) for angle in angles for f in (th.sin, th.cos)]], dim=-1)
 
 
+IMAGE_TOKENS = 2048
+"""Without gradients, long sequences of images go through the CNN in parts of this size, for the memory that it takes."""
+
 Convolutions = Sequence[tuple[int, int, int, int]]
 """Channels, kernel, stride and max-pooling (1: none) of each layer."""
 
@@ -233,7 +236,8 @@ class TokenFeatures(nn.Module):
     :param fourier_inputs: indices of the common observation's numbers that have Fourier features; None: all, and the action
     :param normalize: whether the common observation and the action are brought to zero mean and unit variance. Where little
         of what varies matters, as a few centimetres of jitter beside a reading, their own scale tells the encoder more.
-    :raises ValueError: if the image is too small for the convolutions, or there are no such ``fourier_inputs``
+    :raises ValueError: if the image is too small for the convolutions, there are no such ``fourier_inputs``, or no layer is
+        ``hidden``
     """
 
     def __init__(
@@ -261,6 +265,8 @@ class TokenFeatures(nn.Module):
             raise ValueError(
                 f"fourier_inputs={fourier_inputs}: indices of the common observation, which has {common.shape[0]} numbers."
             )
+        if not hidden:
+            raise ValueError("`hidden`, or `hidden_beside_image`, is empty: give each kind of input one layer or more.")
         self.common_normalizer = RunningNormalizer(n_common) if normalize else None
         self.common_fourier = FourierFeatures(frequencies, fourier_inputs)
         self.common = mlp(self.common_fourier.width(n_common), hidden)
@@ -304,6 +310,18 @@ class TokenFeatures(nn.Module):
             batch = images.shape[:-3]
             parts.append(self.image(images.reshape(-1, *images.shape[-3:])).view(*batch, self.image.width))
         return self.trunk(th.cat(parts, dim=-1))
+
+    def in_parts(self, tokens: Tokens) -> th.Tensor:
+        """
+        Features of whole sequences; without gradients, images go through the CNN by ``IMAGE_TOKENS``.
+
+        :param tokens: ``(n_tokens, *shape of the key)``
+        :return: ``(n_tokens, width)``
+        """
+        if th.is_grad_enabled() or not self.has_image:
+            return self(tokens)  # type: ignore[no-any-return]
+        parts = zip(*(tensor.split(IMAGE_TOKENS) for tensor in tokens.values()), strict=True)
+        return th.cat([self(dict(zip(tokens, part, strict=True))) for part in parts])
 
     def _common_vector(self, tokens: Tokens) -> th.Tensor:
         parts = [tokens[COMMON].float(), tokens[PREVIOUS_ACTION]]

@@ -228,7 +228,8 @@ class TransformerMemory(Memory):
         mask = token_mask(lengths)
         n_tokens = mask.shape[1]
         padded = _padded(features, mask)
-        position = th.arange(n_tokens, dtype=features.dtype, device=features.device)
+        # Not of the features' type: bfloat16, which they may have, cannot tell 256 from 257.
+        position = th.arange(n_tokens, dtype=self.slopes.dtype, device=features.device)
         bias = self.slopes[:, None, None] * _recency(position[:, None], position)
         keys, values = [], []
         for block in self.blocks:
@@ -251,8 +252,8 @@ class TransformerMemory(Memory):
             padding = (0, 0, 0, keys.shape[3])
             keys, values = F.pad(keys, padding), F.pad(values, padding)
         rows = th.arange(len(features), device=features.device)
-        position = th.arange(n_tokens, dtype=features.dtype, device=features.device)
-        recency = _recency(length[:, None].to(features.dtype), position)
+        position = th.arange(n_tokens, dtype=self.slopes.dtype, device=features.device)
+        recency = _recency(length[:, None], position)
         bias = self._grouped(self.slopes[:, None] * recency[:, None])
         features = features[:, None]
         for index, block in enumerate(self.blocks):

@@ -154,8 +154,11 @@ class CompiledGRU(th.autograd.Function):
         :param bias: hidden part, ``(3 * width,)``
         :param lengths: of the sequences, ``(n_sequences,)``; their sum is ``n_tokens``
         :return: hidden states after each token, ``(n_tokens, width)``
+        :raises ValueError: if they are not
         """
         n_tokens, width = len(gates), weight.shape[1]
+        if int(lengths.sum()) != n_tokens:
+            raise ValueError(f"There are {n_tokens} tokens, but the lengths of the sequences add up to {int(lengths.sum())}.")
         hidden, candidate, recurrent = (gates.new_empty(n_tokens, width) for _ in range(3))
         switches = gates.new_empty(n_tokens, 2 * width)  # reset and update gate
         inputs = gates, weight.t(), bias, lengths

@@ -102,6 +102,8 @@ class ActiveTMazeEnv(gym.Env):
         return self._observe(), {"is_success": False, "position": (self.x, self.y)}
 
     def step(self, action: int) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        if not 0 <= action < len(self.MOVES):
+            raise ValueError(f"An action must be a whole number from 0 and below {len(self.MOVES)}, got {action}.")
         self.time += 1
         dx, dy = self.MOVES[action]
         if dx and self.y == 0:

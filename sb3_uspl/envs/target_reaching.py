@@ -63,6 +63,9 @@ class TargetReachingEnv(gym.Env):
         return self._observe(), {"is_success": False, "position": self.position.copy()}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        action = np.asarray(action)
+        if action.shape != (2,) or not np.isfinite(action).all():
+            raise ValueError(f"An action must be two finite numbers, got {action.tolist()}.")
         before = np.linalg.norm(self.target - self.position)
         self.position = np.clip(self.position + self.SPEED * np.clip(action, -1.0, 1.0), -1.0, 1.0)
         after = np.linalg.norm(self.target - self.position)

@@ -1,5 +1,6 @@
 """Laws of waiting for another process: no message is missed, and only what comes soon is waited for awake."""
 
+import functools
 import multiprocessing
 import time
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ class Simulated:
     def __init__(self, monkeypatch):
         self.now, self.comes, self.glances, self.naps = 0.0, 0.0, 0, 0
         monkeypatch.setattr(adaptive_wait, "time", SimpleNamespace(perf_counter=lambda: self.now))
+        monkeypatch.setattr(adaptive_wait, "_glance", lambda connection: functools.partial(connection.poll, 0))
 
     def poll(self, timeout):
         if timeout == 0:

@@ -224,7 +224,7 @@ def test_rewards_are_of_the_truth_by_the_second(compiled):
         assert (info["reward_terms"]["low"] == pytest.approx(-0.3)) == (robot.state.altitude < 0.3)
         pilot(observation)
     assert info["reward_terms"]["low"] == pytest.approx(-0.3)
-    assert task.outcome(robot.state) is task.outcome(robot.state) is Outcome.RUNNING
+    assert task.judge(robot.state) is task.judge(robot.state) is Outcome.RUNNING
 
 
 def test_the_prior_is_on_the_scale_of_the_paper_and_apart_from_the_readings(compiled):

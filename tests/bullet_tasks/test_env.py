@@ -121,6 +121,14 @@ def test_time_limit_truncates(env_id):
     env.close()
 
 
+def test_gymnasium_collects_pictures(env_id):
+    env = gymnasium.make(env_id, render_mode="rgb_array_list")
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape, np.float32))
+    assert len(env.render()) == 2
+    env.close()
+
+
 def test_pictures_show_the_robot_move(env_id):
     env = gymnasium.make(env_id, render_mode="rgb_array")
     env.reset(seed=0)

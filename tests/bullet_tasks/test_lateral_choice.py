@@ -106,7 +106,7 @@ def test_the_bonus_counts_the_time_left(env):
     task = env.unwrapped.task
     env.reset(seed=0)
     state = RobotState(task.goal[0], 0.0, 0.3, 0.0, 0.0, 0.0, False)
-    assert task.outcome(state) is Outcome.SUCCESS
+    assert task.judge(state) is Outcome.SUCCESS
     task.begin(state, env.unwrapped.world.scene)
     assert task.reward_terms(state, 0.0, 0.25, Outcome.SUCCESS)["goal_bonus"] == 4.5
     assert task.reward_terms(state, 0.1, 0.25, Outcome.RUNNING)["collision"] == pytest.approx(-0.3)

@@ -99,8 +99,8 @@ def test_goal_and_dead_zones_are_the_four_corners(env, corner):
     assert {task.goal, *task.dead_zones} == {(x * 2.4, y * 1.55) for x, y in CORNERS} and len(task.dead_zones) == 3
     for centre in (task.goal, *task.dead_zones):
         inside, outside = (RobotState(centre[0] - dx, centre[1], 0.3, 0.0, 0.0, 0.0, False) for dx in (0.39, 0.41))
-        assert task.outcome(inside) is (Outcome.SUCCESS if centre == task.goal else Outcome.FAILURE)
-        assert task.outcome(outside) is Outcome.RUNNING
+        assert task.judge(inside) is (Outcome.SUCCESS if centre == task.goal else Outcome.FAILURE)
+        assert task.judge(outside) is Outcome.RUNNING
 
 
 def test_nothing_tells_the_corner_at_the_start(env):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.connection import Connection
 
 import gymnasium
 import numpy as np
@@ -50,6 +51,7 @@ class ToyEnv(gymnasium.Env):
     :param die_at: step at which its process dies
     :param slow: time that a step takes, s
     :param interrupts: process that it interrupts in the middle of its first step
+    :param hangs: whether it does so for ever
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -63,12 +65,13 @@ class ToyEnv(gymnasium.Env):
         die_at=None,
         slow=0.0,
         interrupts=None,
+        hangs=False,
         render_mode=None,
     ):
         self.number = number
         self.observation_space = observation_space or OBSERVATION_SPACES[0]
         self.action_space = action_space or ACTION_SPACES[1]
-        self.fail_at, self.die_at, self.slow, self.interrupts = fail_at, die_at, slow, interrupts
+        self.fail_at, self.die_at, self.slow, self.interrupts, self.hangs = fail_at, die_at, slow, interrupts, hangs
         self.render_mode = render_mode
         self.unpicklable = lambda: None
         self.last_options = None
@@ -90,9 +93,9 @@ class ToyEnv(gymnasium.Env):
             raise OSError(f"the motor of number {self.number} is on fire")
         if self.steps == self.die_at:
             os._exit(7)
-        if self.interrupts is not None:
+        while self.interrupts is not None:
             os.kill(self.interrupts, signal.SIGINT)
-            self.interrupts = None
+            self.interrupts = self.interrupts if self.hangs else None
             time.sleep(0.05)
         end = self.np_random.random()
         return self._observe(), self.np_random.random() / 3, end < 0.1, end > 0.8, {"action": action, "end": end}
@@ -312,6 +315,27 @@ def test_a_worker_that_is_killed_between_steps_is_reported(env):
         env.step(actions(env))
 
 
+class MotorError(Exception):
+    """Does not survive the way between processes."""
+
+    def __init__(self, number, reason):
+        super().__init__(f"motor {number}: {reason}")
+
+
+class BrokenEnv(ToyEnv):
+    def step(self, action):
+        raise MotorError(self.number, "on fire")
+
+
+@pytest.mark.parametrize(("n_workers", "error"), [(1, MotorError), (2, RuntimeError)])
+def test_an_error_that_cannot_travel_is_told_and_in_this_process_raised(n_workers, error):
+    env = BulletVecEnv([*toys(1), BrokenEnv], n_workers=n_workers)
+    env.reset()
+    with pytest.raises(error) as caught:
+        env.step(actions(env))
+    assert "motor 0: on fire" in str(caught.value.__cause__)
+
+
 def fail():
     raise FileNotFoundError("no such robot")
 
@@ -347,6 +371,38 @@ def test_an_interrupted_step_is_lost_and_no_more(place):
             env.step(actions(env))
         reference.step(actions(env))
         assert_same(list(env.step(actions(env))), list(reference.step(actions(env))))
+
+
+@pytest.mark.usefixtures("ctrl_c_interrupts")
+def test_a_step_that_never_ends_can_be_interrupted():
+    env = BulletVecEnv([functools.partial(ToyEnv, interrupts=os.getpid(), hangs=True)], n_workers=1)
+    env.reset()
+    with pytest.raises(KeyboardInterrupt):
+        env.step(actions(env))
+    env.close()
+
+
+@pytest.mark.usefixtures("ctrl_c_interrupts")
+@pytest.mark.parametrize("moment", ["send_bytes", "recv_bytes"])
+def test_an_interrupt_never_parts_a_message_from_its_being_noted(env, monkeypatch, moment):
+    """As soon as it is sent or read, before anything else."""
+    reference = DummyVecEnv(toys())
+    for vec_env in (env, reference):
+        vec_env.seed(0)
+        vec_env.reset()
+    original = getattr(Connection, moment)
+
+    def interrupted(self, *args):
+        result = original(self, *args)
+        monkeypatch.undo()
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(Connection, moment, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        env.step(actions(env))
+    reference.step(actions(env))
+    assert_same(list(env.step(actions(env))), list(reference.step(actions(env))))
 
 
 def test_reset_throws_a_running_step_away(env):

@@ -121,16 +121,6 @@ def test_oldest_episodes_leave_first_within_the_byte_budget():
     assert episodes.replay[-1] is newest
 
 
-def test_an_episode_with_a_gap_is_dropped():
-    episodes = make_episodes()
-    episodes.add(observation([0] * 4, 0))
-    episodes.add(observation([2, 1, 1, 1], 1))  # environment 0 lost a decision
-    for step in range(2, 4):
-        episodes.add(observation([step + 1, step, step, step], step))
-    episodes.add(observation([0] * 4, 9))
-    assert sorted(episode.arrays["truth"][0, 0] for episode in episodes.fresh) == [1, 2, 3]
-
-
 def test_an_episode_longer_than_the_context_is_refused():
     episodes = make_episodes(context_length=5)
     with pytest.raises(ValueError, match=r"longer than the encoder's context of 5.*context_length"):

@@ -122,15 +122,23 @@ def test_taken_rows_are_independent(name):
         th.testing.assert_close(part, old)
 
 
-def test_the_future_does_not_reach_the_past():
-    memory = make_memory("transformer")
-    features = th.randn(6, 16)
+@pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
+@pytest.mark.parametrize("now", [4, 600])
+def test_the_future_does_not_reach_the_past(now, dtype):
+    memory, lengths = make_memory("transformer"), th.tensor([now + 3])
+    features = th.randn(now + 3, 16, dtype=dtype)
     changed = features.clone()
-    changed[4:] += 1.0
-    with th.no_grad():
-        a, b = memory(features, th.tensor([6]))[0], memory(changed, th.tensor([6]))[0]
-    th.testing.assert_close(a[:4], b[:4])
-    assert not th.allclose(a[4:], b[4:])
+    changed[now:] += 1.0
+    with th.no_grad(), th.autocast("cpu", th.bfloat16, enabled=dtype is th.bfloat16):
+        a, b = memory(features, lengths)[0], memory(changed, lengths)[0]
+    th.testing.assert_close(a[:now], b[:now], atol=0.0, rtol=0.0)
+    assert not th.allclose(a[now:], b[now:])
+
+
+def test_lengths_that_do_not_add_up_are_refused():
+    for lengths in ([3, 4], [3, 1]):
+        with pytest.raises(ValueError, match="There are 6 tokens"):
+            make_memory("gru")(th.randn(6, 16), th.tensor(lengths))
 
 
 def test_eq_1_hand_computed():
@@ -323,10 +331,12 @@ def test_the_paper_preset_has_the_papers_transformer():
         {"overrides": {"depth": 3}},
         {"overrides": {"categorical": True}},
         {"overrides": {"fourier_inputs": (0, 2)}},
+        {"overrides": {"memory_kwargs": {"n_heads": 8}}},
+        {"overrides": {"hidden": ()}},
     ],
 )
 def test_impossible_architecture_is_refused(kwargs):
-    with pytest.raises(ValueError, match=r"presets are|unknown entries|discrete_privileged|which has 2 numbers"):
+    with pytest.raises(ValueError, match=r"presets are|unknown entries|discrete_privileged|which has 2 numbers|is empty"):
         ObservationEncoder(ToyEnv().observation_space, 1, **kwargs)
 
 

@@ -38,6 +38,17 @@ def test_a_seed_fixes_an_episode(env_id):
                 break
 
 
+@pytest.mark.parametrize(
+    ("env_id", "action"),
+    [("TargetReaching-v0", [1.0]), ("TargetReaching-v0", [0.0, np.nan]), ("ActiveTMaze-v0", 4), ("ActiveTMaze-v0", -1)],
+)
+def test_impossible_actions_are_refused(env_id, action):
+    env = gym.make(env_id, disable_env_checker=True)
+    env.reset()
+    with pytest.raises(ValueError, match="An action must be"):
+        env.step(action)
+
+
 def test_the_papers_behaviour_reaches_every_target_and_going_one_way_does_not():
     def run(seed, direction_of):
         obs, _ = env.reset(seed=seed)

@@ -61,6 +61,12 @@ def test_the_first_mean_action_is_the_chosen_one_before_training_and_after_a_res
     np.testing.assert_allclose(mean(), (-0.3, 3.0), atol=0.05)
 
 
+def test_a_policy_that_starts_anew_stays_on_its_device():
+    policy = make_model(policy_kwargs=dict(initial_action=(0.3,)), env_kwargs={}).policy.to("meta")
+    policy.restart(lambda remaining: 1e-3)
+    assert {part.device.type for part in (*policy.parameters(), *policy.buffers())} == {"meta"}
+
+
 @pytest.mark.parametrize("action", [(0.0,), (0.0, 1.0), (0.0, np.nan)], ids=["shape", "at the bound", "nan"])
 def test_an_initial_action_that_the_action_space_does_not_hold_is_refused(action):
     with pytest.raises(ValueError, match=r"`initial_action` must be .* inside its bounds, got"):

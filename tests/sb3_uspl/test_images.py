@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_uspl import RMA, USPLPPO, RESeLPPO
 from sb3_uspl.encoder import MEMORIES, ImageCNN, ObservationEncoder, gaussian_nll
-from sb3_uspl.encoder import encoder as encoder_module
+from sb3_uspl.encoder import features as features_module
 from sb3_uspl.observations import POLICY_KEYS, TARGET, check_observation_space, is_image
 from tests.sb3_uspl.toy import ToyEnv
 
@@ -145,7 +145,7 @@ def test_parts_of_many_images_equal_all_at_once(monkeypatch):
     at_once = encoder(tokens, lengths)[0].mean.detach()
     calls = []
     encoder.features.image.register_forward_hook(lambda module, inputs, output: calls.append(len(output)))
-    monkeypatch.setattr(encoder_module, "IMAGE_TOKENS", 10)
+    monkeypatch.setattr(features_module, "IMAGE_TOKENS", 10)
     with th.no_grad():
         th.testing.assert_close(encoder(tokens, lengths)[0].mean, at_once, atol=1e-5, rtol=1e-4)
     assert calls == [10, 10, 5]

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_uspl import PrivilegedObservation
+from sb3_uspl import USPLPPO, PrivilegedObservation, RESeLPPO
 from sb3_uspl.observations import check_finite, check_observation_space, policy_observation_space
 from tests.sb3_uspl.toy import IMAGE, ToyEnv
 
@@ -42,6 +44,19 @@ def test_bad_numbers_are_found(value):
     check_finite({"common": np.zeros((2, 3)), "target": np.zeros(3, np.uint8)})
     with pytest.raises(ValueError, match=r"'common' holds (nan|inf) at index \(1, 2\)"):
         check_finite({"common": np.array([[0, 0, 0], [0, 0, value]])})
+
+
+def test_whole_numbers_are_kept_as_fractions_which_normalising_makes_of_them():
+    """In the buffers of all algorithms: what the encoder sees in a rollout is what it learns from."""
+    lidar = spaces.Box(0, 255, (3,), np.uint8)
+    for algorithm in (USPLPPO, RESeLPPO):
+        venv = VecNormalize(make_vec_env(ToyEnv, 8, env_kwargs={"target": lidar}), norm_obs_keys=["common", "target"])
+        model = algorithm("MlpPolicy", venv, n_steps=8, batch_size=32, device="cpu").learn(128)
+        if algorithm is USPLPPO:
+            kept = model.rollout_buffer.episodes.replay[-1].arrays["target"]
+        else:
+            kept = model.rollout_buffer.observations["target"]
+        assert kept.dtype == np.float32 and (kept % 1.0 != 0.0).any()
 
 
 class FlatEnv(gym.Env):
@@ -93,6 +108,12 @@ def test_keys_are_concatenated_and_images_pass_through():
     np.testing.assert_allclose(obs["privileged"], [0.3, 0.3])
     assert obs["target"].dtype == np.uint8 and env.observation_space["target"] == IMAGE
     check_env(env, warn=False)
+
+
+@pytest.mark.parametrize("kwargs", [dict(privileged=["goal"]), dict(privileged=["goal"], target=["camera", "speed"])])
+def test_an_image_among_numbers_is_refused(kwargs):
+    with pytest.raises(ValueError, match=r"\['camera'\].*target=\['camera'\]"):
+        PrivilegedObservation(DictEnv(), **kwargs)
 
 
 @pytest.mark.parametrize(

@@ -420,6 +420,21 @@ def test_without_a_replay_the_encoder_learns_from_each_rollout():
     assert not len(model.rollout_buffer.episodes.replay) and model.policy.encoder_optimizer.state
 
 
+def test_a_training_in_parts_updates_the_encoder_as_often_as_one_in_a_whole():
+    def updates(model):
+        return max(float(state["step"]) for state in model.policy.encoder_optimizer.state.values())
+
+    whole, parts = (make_model(replay_bytes=0, encoder_batch_size=2048) for _ in range(2))
+    whole.learn(4 * 128)
+    for part in range(4):
+        parts.learn(128, reset_num_timesteps=part == 0)
+    assert updates(parts) == updates(whole)
+
+
+def test_a_training_of_no_decisions_ends_at_once():
+    assert make_model().learn(0).num_timesteps == 0
+
+
 class SilentEnv(ToyEnv):
     """Does not say how long a decision lasts."""
 
