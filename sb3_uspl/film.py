@@ -453,10 +453,11 @@ def _write_gif(frames: Sequence[np.ndarray], times: Sequence[float], out: Path) 
 
 
 def _write_mp4(frames: Sequence[np.ndarray], times: Sequence[float], out: Path) -> None:
-    """Still frames are repeated; H.264 wants even sizes."""
+    """Still frames are repeated; H.264 wants even sizes, so that odd ones have their last row or column twice."""
     import imageio.v2 as imageio
 
     with imageio.get_writer(out, fps=FRAMES_PER_SECOND, macro_block_size=2) as writer:
         for frame, time in zip(frames, times, strict=True):
+            even = np.pad(frame, [(0, size % 2) for size in frame.shape[:2]] + [(0, 0)], mode="edge")
             for _ in range(round(time * FRAMES_PER_SECOND)):
-                writer.append_data(frame)  # type: ignore[attr-defined]
+                writer.append_data(even)  # type: ignore[attr-defined]

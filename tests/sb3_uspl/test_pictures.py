@@ -16,7 +16,7 @@ import bullet_tasks  # noqa: F401
 from sb3_uspl import USPLPPO
 from sb3_uspl.envs import TargetReachingEnv
 from sb3_uspl.evaluation import EpisodeRecord
-from sb3_uspl.film import FIRST_FRAME_TIME, FRAMES_PER_SECOND, LAST_FRAME_TIME, _as_grey, film, record_clip
+from sb3_uspl.film import FIRST_FRAME_TIME, FRAMES_PER_SECOND, LAST_FRAME_TIME, _as_grey, _write_mp4, film, record_clip
 from sb3_uspl.pictures import _quantile_over_time, _read_progress, learning_curve, on_map, sigma_over_time
 from sb3_uspl.replay import page_data
 
@@ -174,6 +174,19 @@ def test_mp4_repeats_still_frames(tmp_path):
     film({"USPL": tiny(env)}, env, [0], tmp_path / "film.mp4")
     with imageio.get_reader(tmp_path / "film.mp4") as reader:
         assert reader.count_frames() == round((FIRST_FRAME_TIME + LAST_FRAME_TIME) * FRAMES_PER_SECOND) + 2
+
+
+def test_mp4_of_an_odd_size_is_a_pixel_larger_and_not_resized(tmp_path, caplog):
+    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio_ffmpeg")
+    stripes = np.zeros((351, 33, 3), np.uint8)
+    stripes[100:120] = 255
+    _write_mp4([stripes], [1.0], tmp_path / "film.mp4")
+    with imageio.get_reader(tmp_path / "film.mp4") as reader:
+        shown = reader.get_data(0)
+    assert shown.shape == (352, 34, 3) and not caplog.records
+    bright = np.flatnonzero(shown[:, 10, 0] > 128)
+    assert (bright[0], bright[-1]) == (100, 119)
 
 
 def test_what_cannot_be_filmed_is_refused(tmp_path, corridor):
