@@ -135,6 +135,13 @@ def test_the_future_does_not_reach_the_past(now, dtype):
     assert not th.allclose(a[now:], b[now:])
 
 
+def test_what_is_not_a_number_stays_so_until_the_end_of_its_episode_and_no_longer():
+    features = th.randn(12, 16)
+    features[7, 3] = th.nan
+    remembered = make_memory("gru")(features, th.tensor([5, 5, 2]))[0]
+    assert remembered.isnan().any(1).tolist() == [False] * 7 + [True] * 3 + [False] * 2
+
+
 def test_lengths_that_do_not_add_up_are_refused():
     for lengths in ([3, 4], [3, 1]):
         with pytest.raises(ValueError, match="There are 6 tokens"):
