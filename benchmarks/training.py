@@ -7,14 +7,12 @@ the encoder only, and PPO's minibatches are so many fewer. Plain PPO sees the pr
 
 import contextlib
 import functools
-import inspect
 import math
 import statistics
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from benchmarks.contenders import (
@@ -67,9 +65,6 @@ RECURRENT_TARGET, RMA_TARGET, ROLLOUT_TARGET, SPEED_TARGET = 10.0, 1.1, 1.5, 10_
 ALL_AT_ONCE: Settings = dict(warmup_timesteps=0, ramp_timesteps=1, target_kl=None, seed=0, device="cpu")
 """Blurring and reward transformation at full strength from the start, and no update cut short."""
 
-BY_EPISODES = ("USPLPPO", "RMA")
-"""Their encoder learns from episodes that have ended: iterations are alike only over the length of an episode."""
-
 QUICK: dict[str, Any] = dict(
     repetitions=1,
     tasks=(Task("LateralChoice-v0", {"physics": "compiled"}, 32),),
@@ -98,13 +93,12 @@ def settings_for(task: Task, n_envs: int | None = None, decisions: int | None = 
 
 def default_settings(n_envs: int, decisions: int | None = None) -> Settings:
     """
-    Nothing of the zoo's: a library's own defaults, but rollouts as long as RecurrentPPO's for all of them.
+    Nothing of the zoo's: each library's own defaults.
 
     :param n_envs: number of environments
-    :param decisions: of an iteration, in all environments; None takes RecurrentPPO's number of steps
+    :param decisions: of an iteration, in all environments; None takes each library's number of steps
     """
-    n_steps = inspect.signature(RecurrentPPO).parameters["n_steps"].default if decisions is None else decisions // n_envs
-    return {**ALL_AT_ONCE, "n_steps": n_steps}
+    return ALL_AT_ONCE if decisions is None else {**ALL_AT_ONCE, "n_steps": decisions // n_envs}
 
 
 @contextlib.contextmanager
@@ -166,7 +160,8 @@ def compare_methods(
     task: Task, settings: Settings, threads: int = 1, repetitions: int = 5, methods: Sequence[str] = METHODS
 ) -> dict[str, list[float]]:
     """
-    Samples per second of every method.
+    Samples per second of every method, over whole episodes: encoders learn when one has ended, and RecurrentPPO's LSTM goes
+    through a minibatch in one call unless one begins in it.
 
     :param task: to learn
     :param settings: of USPL; the others have what they know of them
@@ -176,11 +171,10 @@ def compare_methods(
     :return: values by method
     """
     contenders = {}
-    cycle = iterations_per_episode(task, settings["n_steps"])
     with contextlib.ExitStack() as stack:
         for method in methods:
             model = stack.enter_context(ready(method, task, task.n_envs, settings))
-            iterations = cycle if method in BY_EPISODES else 1
+            iterations = iterations_per_episode(task, model.n_steps)
             contenders[method] = functools.partial(samples_per_second, model, threads, iterations)
         return interleave(contenders, repetitions)
 

@@ -103,6 +103,8 @@ class FourierFeatures(nn.Module):
         super().__init__()
         self.frequencies = frequencies
         self.inputs = None if inputs is None else list(inputs)
+        self.octaves: th.Tensor
+        self.register_buffer("octaves", 0.5 * math.pi * 2.0 ** th.arange(frequencies), persistent=False)
 
     def width(self, n_inputs: int) -> int:
         """
@@ -116,9 +118,11 @@ class FourierFeatures(nn.Module):
         :param x: ``(..., n_inputs)``, of about unit variance
         :return: ``(..., width(n_inputs))``
         """
+        if self.frequencies == 0:
+            return x
         chosen = x if self.inputs is None else x[..., self.inputs]
-        angles = [chosen * (0.5 * math.pi * 2.0**octave) for octave in range(self.frequencies)]
-        return th.cat([x, *[f(angle) for angle in angles for f in (th.sin, th.cos)]], dim=-1)
+        angles = chosen[..., None, :] * self.octaves[:, None]
+        return th.cat((x, th.stack((angles.sin(), angles.cos()), dim=-2).flatten(-3)), dim=-1)
 
 
 IMAGE_TOKENS = 2048

@@ -127,8 +127,8 @@ class GRUMemory(Memory):
         return CompiledGRU.apply(gates, hidden_weight, hidden_bias, lengths)
 
     def step(self, features: th.Tensor, state: MemoryState, longest: int | None = None) -> tuple[th.Tensor, MemoryState]:
-        outputs, hidden = self.gru(features[:, None], state[0][None].contiguous())
-        return outputs[:, 0], (hidden[0],)
+        hidden = th.gru_cell(features, state[0], *self.gru.parameters())
+        return hidden, (hidden.clone(),)
 
 
 class MaxMemory(Memory):
