@@ -213,7 +213,8 @@ class EpisodeReplayBuffer:
             sizes = th.as_tensor(np.concatenate([size for _, size in pieces]), device=device)
             all_places = th.as_tensor(places, device=device).split([int(size.sum()) for _, size in pieces])
             for place, size in zip(all_places, sizes.split([len(size) for _, size in pieces]), strict=True):
-                tokens, truth = {key: value[place] for key, value in staged.tokens.items()}, staged.truth[place]
+                tokens = {key: value.index_select(0, place) for key, value in staged.tokens.items()}  # whole images at once
+                truth = staged.truth.index_select(0, place)
                 if self.symmetries is not None:
                     which = self.symmetries.random(size, self.rng)
                     turned = self.symmetries.turn({COMMON: tokens[COMMON], TRUTH: truth}, which)
