@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -305,6 +305,9 @@ class USPLRolloutBuffer(DictRolloutBuffer):
     :param kwargs: as for ``DictRolloutBuffer``
     """
 
+    VALUED_AT_ONCE = 8192
+    """Observations that the critic is shown together."""
+
     def __init__(
         self,
         buffer_size: int,
@@ -316,6 +319,8 @@ class USPLRolloutBuffer(DictRolloutBuffer):
         self.n_mismatched = n_mismatched
         self.n_collecting = kwargs.get("n_envs", 1)
         self.episodes: EpisodeReplayBuffer | None = None
+        self.critic: Callable[[dict[str, th.Tensor]], th.Tensor] | None = None
+        """Values the observations when the rollout is over, many at once, in place of the values that came with them."""
         super().__init__(buffer_size, policy_observation_space(observation_space), action_space, **kwargs)
 
     def reset(self) -> None:
@@ -331,6 +336,21 @@ class USPLRolloutBuffer(DictRolloutBuffer):
         super().add(obs, *args, **kwargs)
         if self.episodes is not None:
             self.episodes.add(obs)
+
+    @th.no_grad()
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
+        """
+        :param last_values: of the observations after the rollout, ``(n_envs, 1)``
+        :param dones: whether they begin an episode, ``(n_envs,)``
+        """
+        if self.critic is not None:
+            n_matched = self.n_envs - self.n_mismatched
+            n_steps = max(1, self.VALUED_AT_ONCE // n_matched)
+            for first in range(0, self.buffer_size, n_steps):
+                part = slice(first, first + n_steps), slice(n_matched)
+                obs = {key: self.to_torch(array[part]).flatten(0, 1) for key, array in self.observations.items()}
+                self.values[part] = self.critic(obs).cpu().numpy().reshape(-1, n_matched)
+        super().compute_returns_and_advantage(last_values, dones)
 
     def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
         if not self.generator_ready and self.n_mismatched > 0:

@@ -88,6 +88,9 @@ class USPLPolicy(ContractPolicy):
         ``initial_action`` that the action space does not hold
     """
 
+    critic_waits = False
+    """Whether ``forward`` leaves the critic out, see :meth:`without_critic`."""
+
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -190,7 +193,13 @@ class USPLPolicy(ContractPolicy):
         return {**data, "observation_space": self.contract, **self.encoder_arguments, **self.feature_arguments}
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        return super().forward(self._only_policy_keys(obs), deterministic)  # type: ignore[arg-type]
+        obs = self._only_policy_keys(obs)
+        if not self.critic_waits:
+            return super().forward(obs, deterministic)  # type: ignore[arg-type]
+        distribution = self.get_distribution(obs)
+        actions = distribution.get_actions(deterministic)
+        nothing = actions.new_zeros((len(actions), 1), dtype=th.float32)
+        return actions.reshape((-1, *self.action_space.shape)), nothing, distribution.log_prob(actions)  # type: ignore[misc]
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
         return super().predict_values(self._only_policy_keys(obs))
@@ -241,6 +250,15 @@ class USPLPolicy(ContractPolicy):
             yield encoder
         finally:
             self.encoder = encoder
+
+    @contextlib.contextmanager
+    def without_critic(self) -> Iterator[None]:
+        """Within this context, ``forward`` returns zeros for values: a rollout needs them only when it is over."""
+        self.critic_waits = True
+        try:
+            yield
+        finally:
+            self.critic_waits = False
 
     def restart(self, lr_schedule: Schedule) -> None:
         """

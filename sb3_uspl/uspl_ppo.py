@@ -311,6 +311,7 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
             self.seed,
         )
         self.rollout_buffer.episodes.symmetries = self.policy.symmetries
+        self.rollout_buffer.critic = self.policy.predict_values
         if self.action_std is not None and isinstance(self.action_space, spaces.Box):
             self._action_std_share: CosineSchedule | None = CosineSchedule(1.0, self.action_std_floor)
             self.policy.set_action_std(self.action_std)
@@ -400,7 +401,7 @@ class USPLPPO(WrappedExperience[UncertaintyVecWrapper]):
             correlation = smoothing_factor(self.action_noise_time * (1.0 - fall), self.decision_period)
             self.policy.action_dist.correlation = correlation
         # A rollout's batches are too small for several threads, which would take the cores from the environments' workers.
-        with torch_threads(1):
+        with torch_threads(1), self.policy.without_critic():
             return self._collect_in_wrapper(callback, rollout_buffer, n_rollout_steps)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_uspl import RMA, USPLPPO, MlpPolicy
 from sb3_uspl._threads import torch_threads
+from sb3_uspl.buffers import USPLRolloutBuffer
 from sb3_uspl.observations import BELIEF, UNCERTAINTY
 from tests.sb3_uspl.toy import ToyEnv
 
@@ -86,6 +87,30 @@ def test_same_seed_same_run(algorithm):
 
 
 # -- separation of the two learners ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at_once", [5, 30, 8192])
+def test_the_critic_is_asked_when_a_rollout_is_over(at_once, monkeypatch):
+    """However many observations at once; a policy that is called outside of rollouts asks its critic at once."""
+    monkeypatch.setattr(USPLRolloutBuffer, "VALUED_AT_ONCE", at_once)
+    model, seen = make_model(), []
+
+    class Look(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            buffer = model.rollout_buffer
+            obs = {key: th.as_tensor(array[:, :6]).flatten(0, 1) for key, array in buffer.observations.items()}
+            with th.no_grad():
+                seen.append((th.as_tensor(buffer.values[:, :6]).flatten(), model.policy.predict_values(obs)[:, 0]))
+
+    model.learn(2 * 8 * 16, callback=Look())
+    for stored, expected in seen:
+        th.testing.assert_close(stored, expected)
+        assert expected.std() > 0.0
+    obs = {key: th.as_tensor(value) for key, value in model._last_obs.items()}
+    th.testing.assert_close(model.policy(obs)[1], model.policy.predict_values(obs))
 
 
 def test_ppo_and_encoder_never_touch_each_others_weights():
