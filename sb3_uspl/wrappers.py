@@ -189,7 +189,8 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
         space = venv.observation_space[PRIVILEGED]  # type: ignore[index]
         self.low, self.high = space.low, space.high
         self.noise = BlurNoise(self.num_envs, space.shape[0], config, self.rng)
-        self.metrics: dict[str, list[float]] = defaultdict(list)
+        self.metrics: dict[str, list[np.ndarray]] = defaultdict(list)
+        """What happened in matched environments since the last update, one array a decision."""
         self._shape = (self.num_envs, space.shape[0])
         self._n_matched = self.num_envs - config.n_mismatched
         if config.mismatch_hold is not None:
@@ -241,7 +242,7 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
             config = self.config
             scale = reward_coefficient(self.std, self.progress, config.c_min, config.c_max, config.delta)
             rewards = (rewards * scale).astype(np.float32)
-            self.metrics["reward_scale"].append(float(scale[: self._n_matched].mean()))
+            self.metrics["reward_scale"].append(scale[: self._n_matched])
         self.step_count += 1
         rows = np.flatnonzero(dones)
         if len(rows):
@@ -283,9 +284,9 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
         if self._wandering is not None:
             self._wandering.advance()
         n, truth = self._n_matched, obs[PRIVILEGED]
-        self.metrics["uncertainty"].append(float(self.std[:n].mean()))
-        self.metrics["prediction_error"].append(float(np.abs(mean[:n] - truth[:n]).mean()))
-        self.metrics["blur"].append(float(np.abs(shown[:n] - truth[:n]).mean()))
+        self.metrics["uncertainty"].append(self.std[:n])
+        self.metrics["prediction_error"].append(np.abs(mean[:n] - truth[:n]))
+        self.metrics["blur"].append(np.abs(shown[:n] - truth[:n]))
         return out
 
     def _rewrite_terminal(self, rows: np.ndarray, infos: list[dict]) -> None:

@@ -56,7 +56,7 @@ class PenaltyVecWrapper(UncertaintyVecWrapper):
         # Before the step: the reward is that of the action taken on the observation that is now the last one.
         divergence = self._divergence()
         obs, rewards, dones, infos = super().step_wait()
-        self.metrics["divergence"].append(float(divergence[: self._n_matched].mean()))
+        self.metrics["divergence"].append(divergence[: self._n_matched])
         return obs, (rewards - self.progress * self.weight * divergence).astype(np.float32), dones, infos
 
     @th.no_grad()
