@@ -276,6 +276,13 @@ class Simulation:
         )
         return np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[:, :, :3].copy()
 
+    def __reduce__(self) -> Any:
+        # A copy would have the same client: a step in one would be a step in both.
+        raise TypeError(
+            "A PyBullet world that is open can be neither copied nor pickled. Make another environment instead, or take "
+            'physics="compiled", of which copies are independent as long as no picture has been taken.'
+        )
+
     def close(self) -> None:
         """Disconnect; a second call does nothing."""
         if self.closed:

@@ -230,6 +230,7 @@ class BulletVecEnv(VecEnv):
         if not np.can_cast(actions.dtype, shared.dtype, casting="same_kind"):
             raise ValueError(f"Actions must be of a type that fits into {shared.dtype}, got {actions.dtype}.")
         self._settle()
+        self.actions = actions  # as SB3's `DummyVecEnv` has them
         np.copyto(shared, actions, casting="same_kind")
         self._post(dict.fromkeys(range(len(self._hosts)), ("step", ())))
         self.waiting = True

@@ -14,10 +14,12 @@ def load_entries(path: Path) -> dict[str, dict[str, Any]]:
     """
     Read a zoo file, one entry an environment. Three more keys let algorithms share what should not differ between them::
 
-        inherit: uspl_ppo.yml    # the entries of that file, beside this one; what this file says goes over them
+        inherit: uspl_ppo.yml    # the entries of that file; what this file says goes over them
         keep: [env_kwargs, gamma]  # of those entries nothing else; without it, all
         every: {blur: false}     # goes over every entry, inherited or not
         LateralChoice-v0: {...}  # goes over that entry, after ``every``
+
+    What is inherited from lies beside the file, or else in ``zoo_configs/``.
 
     :param path: YAML file
     :return: hyperparameters by environment
@@ -25,6 +27,11 @@ def load_entries(path: Path) -> dict[str, dict[str, Any]]:
         what no inherited entry has
     """
     return _load(path, ())
+
+
+def _beside(path: Path, name: str) -> Path:
+    beside, ours = path.parent / name, CONFIGS / name
+    return ours if ours.is_file() and not beside.is_file() else beside
 
 
 def _load(path: Path, heirs: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
@@ -39,7 +46,7 @@ def _load(path: Path, heirs: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
         raise ValueError(f"{path} holds a {type(given).__name__}; expected a mapping of environments to hyperparameters.")
     parent, every = given.pop(INHERIT, None), given.pop(EVERY, None) or {}
     keep = given.pop(KEEP, None)
-    entries = _load(path.parent / parent, (*heirs, path)) if parent else {}
+    entries = _load(_beside(path, parent), (*heirs, path)) if parent else {}
     if keep is not None:
         unknown = sorted(set(keep) - {name for entry in entries.values() for name in entry})
         if unknown:

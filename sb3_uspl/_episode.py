@@ -124,7 +124,11 @@ def env_kwargs(arguments: argparse.Namespace) -> dict[str, Any]:
     """
     :param arguments: with ``env_kwargs`` and ``physics``
     :return: arguments of the environment
+    :raises ValueError: if the two name different physics
     """
+    other = arguments.env_kwargs.get("physics", arguments.physics)
+    if arguments.physics and other != arguments.physics:
+        raise ValueError(f"--physics {arguments.physics}, but --env-kwargs says '{other}': name one of them.")
     return {**arguments.env_kwargs, **({"physics": arguments.physics} if arguments.physics else {})}
 
 

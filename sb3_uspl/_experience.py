@@ -30,7 +30,7 @@ class ExperienceVecWrapper(VecEnvWrapper):
         super().__init__(venv)
         self.encoder = encoder
         self.device = next(encoder.parameters()).device
-        self._left: list[dict[str, Any]] = []
+        self._left: list[Any] = []
 
     def reset(self) -> VecEnvObs:
         return self.begin(self.venv.reset())  # type: ignore[arg-type]
@@ -46,12 +46,19 @@ class ExperienceVecWrapper(VecEnvWrapper):
 
     def leave(self) -> None:
         """Remember how a rollout leaves the environments."""
-        self._left = list(self.venv.unwrapped.reset_infos)
+        env = self.venv.unwrapped
+        env.reset_infos = [dict(info) for info in env.reset_infos]  # no environment's: one may give the same at every reset
+        self._left = self._traces()
 
     def was_left_alone(self) -> bool:
-        """Whether no environment has been reset since: each reset's info is an object of its own."""
-        now = self.venv.unwrapped.reset_infos
+        """Whether no environment has been reset or stepped since."""
+        now = self._traces()
         return len(self._left) == len(now) and all(before is after for before, after in zip(self._left, now, strict=True))
+
+    def _traces(self) -> list[Any]:
+        """Objects of which resets and steps replace one at least."""
+        env = self.venv.unwrapped
+        return [*env.reset_infos, getattr(env, "actions", None)]
 
 
 WrapperT = TypeVar("WrapperT", bound=ExperienceVecWrapper)

@@ -101,8 +101,12 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             return super().read_hyperparameters()
         print(f"Loading hyperparameters from: {self.config}")
         given = self.config
+        try:
+            entries = load_entries(Path(given))
+        except ValueError as error:
+            raise SystemExit(str(error)) from error
         with tempfile.NamedTemporaryFile("w", suffix=".yml") as file:
-            yaml.safe_dump(load_entries(Path(given)), file)
+            yaml.safe_dump(entries, file)
             file.flush()
             try:
                 self.config = file.name

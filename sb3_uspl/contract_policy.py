@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_uspl.activations import recoverable_tanh
+from sb3_uspl.encoder import MemoryState
 from sb3_uspl.observations import COMMON, PRIVILEGED, TARGET, check_finite
 from sb3_uspl.policy_features import PolicyFeatures
 
@@ -55,6 +56,22 @@ class ContractPolicy(ActorCriticPolicy):
         assert isinstance(self.action_dist, DiagGaussianDistribution)
         mean = self.action_centre + self.action_half_range * recoverable_tanh(self.action_net(latent_pi))
         return self.action_dist.proba_distribution(mean, self.log_std)
+
+    def _starts(self, episode_start: np.ndarray, n_envs: int) -> np.ndarray:
+        """Which environments have just been reset, ``(n_envs,)``."""
+        starts = np.asarray(episode_start, dtype=bool)
+        if starts.size != n_envs:
+            raise ValueError(f"`episode_start` is about {starts.size} environments but {n_envs} observations were given.")
+        return starts.reshape(n_envs)
+
+    def _as_memory(self, parts: Any, initial: MemoryState) -> MemoryState:
+        """A copy, because the memory is updated in place while the caller may keep the state."""
+        if len(parts) != len(initial):
+            raise ValueError(
+                f"The state's memory has {len(parts)} parts but this policy's has {len(initial)}: pass the state that this "
+                "policy's predict returned, or None to start anew."
+            )
+        return tuple(th.as_tensor(part.copy(), device=self.device) for part in parts)
 
     def set_action_std(self, std: float | Sequence[float] | np.ndarray) -> None:
         """

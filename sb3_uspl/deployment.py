@@ -134,7 +134,7 @@ class DeploymentPolicy(nn.Module):
             actions = (raw > 0.0).long()
         encoded = preprocess_obs(actions, space, normalize_images=False)
         assert isinstance(encoded, th.Tensor)
-        return actions, encoded.flatten(1).float()
+        return actions, encoded.reshape(actions.shape[0], -1).float()
 
     def _add_normalizers(self, normalize: VecNormalize | None) -> None:
         self.normalized: dict[str, float] = {}

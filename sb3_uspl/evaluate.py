@@ -138,7 +138,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         if arguments.replay is not None:
             _episode.write_replay_page(model, venv, arguments)
         result = evaluate(model, venv, arguments.episodes, arguments.seed, arguments.policy)
-    return {"algo": arguments.algo, "env": arguments.env, "physics": arguments.physics, **result}
+    head = {"algo": arguments.algo, "env": arguments.env, "physics": env_kwargs.get("physics"), "env_kwargs": env_kwargs}
+    return {**head, **result}
 
 
 def _print_table(result: dict[str, Any]) -> None:

@@ -65,7 +65,11 @@ def export_policy(
         raise ValueError(f"{out} {'is a folder' if out.is_dir() else 'is what the card is called'}: name the policy's file.")
     policy = DeploymentPolicy(model.policy, horizon, normalize)
     path = out if out.suffix else out.with_suffix(SUFFIXES[file_format])
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {error}") from error
     with _quiet():
         (_write_onnx if file_format == "onnx" else _write_torchscript)(policy, path)
     period = getattr(model, "decision_period", None) if decision_period is None else decision_period

@@ -1,6 +1,7 @@
 """Makes a task with hidden parameters out of an ordinary Gymnasium environment."""
 
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -38,6 +39,11 @@ class HiddenParameters(gym.Wrapper):
     ):
         super().__init__(env)
         space = env.observation_space
+        if isinstance(space, spaces.Dict) and PRIVILEGED in space.spaces:
+            raise ValueError(
+                f"{env} has a privileged observation already, which would become one of its sensors: name all hidden "
+                "parameters in one HiddenParameters around the environment without it."
+            )
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ValueError(
                 f"HiddenParameters takes a one-dimensional Box observation, not {space}: wrap the environment in "
@@ -75,15 +81,18 @@ class HiddenParameters(gym.Wrapper):
                 key for key, value in vars(self.env.unwrapped).items() if isinstance(value, int | float) and key[0] != "_"
             )
             raise ValueError(f"{self.env.unwrapped} has no attribute '{name}'; its numbers are {known}.")
+        try:
+            setattr(self.env.unwrapped, name, getattr(self.env.unwrapped, name))
+        except AttributeError as error:
+            raise ValueError(f"'{name}' of {self.env.unwrapped} cannot be set; give the property a setter: {error}") from error
         if not isinstance(values, tuple | list):
             raise ValueError(f"'{name}': {values!r}; expected a range (low, high) or a list of two or more values.")
+        is_possible = all(isinstance(value, numbers.Real) and math.isfinite(value) for value in values)
         if isinstance(values, tuple):
-            is_possible = len(values) == 2 and values[0] < values[1]
-        else:
-            is_possible = len(set(values)) > 1
-        if not is_possible or not np.isfinite(values).all():
+            is_possible = is_possible and len(values) == 2 and values[0] < values[1]
+        if not is_possible or len(set(values)) < 2:
             raise ValueError(
-                f"'{name}': {values!r}; expected a range (low, high) with low < high, or a list of two or more values."
+                f"'{name}': {values!r}; expected a range (low, high) with low < high, or a list of two or more numbers."
             )
 
     def _observed(self, dim: int, value: float) -> float:

@@ -6,6 +6,7 @@ the package adds is speed, generality and comfort: episodes that outlast a rollo
 callbacks, saving. Here an iteration plays whole episodes in step: arrays ``(time, episode, ...)`` and a mask of what counts.
 """
 
+import argparse
 import math
 from collections import defaultdict, deque
 from collections.abc import Sequence
@@ -380,6 +381,7 @@ def train(settings: Settings, verbose: bool = False) -> tuple[Agent, list[dict[s
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(prog="python -m sb3_uspl.minimal", description=__doc__).parse_args()
     th.set_num_threads(1)
     for title, chosen in {"vanilla": VANILLA, "reward-regularised": REWARD_REGULARISED, "USPL": USPL}.items():
         print(title)

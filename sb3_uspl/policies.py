@@ -288,7 +288,8 @@ class USPLPolicy(ContractPolicy):
         :param episode_start: which environments have just been reset, ``(n_envs,)``
         :param deterministic: the actor's mode instead of a sample
         :return: action(s) and the next state
-        :raises ValueError: for a missing key, a value that is not finite or a state of another number of environments
+        :raises ValueError: for a missing key, a value that is not finite, or a state or ``episode_start`` of another number of
+            environments or of another memory
         """
         return self.act(observation, state, episode_start, deterministic)
 
@@ -320,7 +321,7 @@ class USPLPolicy(ContractPolicy):
         n_envs = len(tokens[COMMON])
         mean, std, previous_action, memory = self._unpack_state(state, n_envs)
         if episode_start is not None:
-            rows = np.asarray(episode_start, dtype=bool).reshape(n_envs)
+            rows = self._starts(episode_start, n_envs)
             std[rows], previous_action[rows] = INITIAL_STD, 0.0
             reset_rows(memory, th.as_tensor(rows, device=self.device))
         tokens[PREVIOUS_ACTION] = th.as_tensor(previous_action, device=self.device)
@@ -359,12 +360,7 @@ class USPLPolicy(ContractPolicy):
                 f"The state holds {len(std)} environments but {n_envs} observations were given: pass the state that predict "
                 "returned for the same environments, or None to start anew."
             )
-        return (
-            mean,
-            std.copy(),
-            previous_action.copy(),
-            tuple(th.as_tensor(part.copy(), device=self.device) for part in memory),
-        )
+        return mean, std.copy(), previous_action.copy(), self._as_memory(memory, self.encoder.memory.initial_state(n_envs))
 
 
 class USPLCnnPolicy(USPLPolicy):

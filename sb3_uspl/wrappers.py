@@ -37,6 +37,9 @@ from sb3_uspl.uncertainty import (
     smooth,
 )
 
+_OUTSIDE = 1e-3
+"""How far a privileged value may be beyond its bounds, relative to their distance: as far as rounding can bring it."""
+
 
 @dataclass
 class UncertaintyConfig:
@@ -176,7 +179,8 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
     :param encoder: observation encoder
     :param config: blurring, reward transformation, smoothing
     :param seed: of the blur noise and the mismatching
-    :raises ValueError: if images or the privileged observation are normalised
+    :raises ValueError: if images or the privileged observation are normalised; in a step, for observations that are not finite
+        or a privileged observation outside of its bounds
     """
 
     encoder: ObservationEncoder
@@ -188,6 +192,8 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
         self.rng = np.random.default_rng(seed)
         space = venv.observation_space[PRIVILEGED]  # type: ignore[index]
         self.low, self.high = space.low, space.high
+        tolerance = _OUTSIDE * (np.where(np.isfinite(space.high - space.low), space.high - space.low, 0.0))
+        self._lowest, self._highest = space.low - tolerance, space.high + tolerance
         self.noise = BlurNoise(self.num_envs, space.shape[0], config, self.rng)
         self.metrics: dict[str, list[np.ndarray]] = defaultdict(list)
         """What happened in matched environments since the last update, one array a decision."""
@@ -268,6 +274,7 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
     def _observe(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Encode the current observation of all environments and build what the policy sees."""
         check_finite(obs)
+        self._check_bounds(obs[PRIVILEGED])
         self._tokens = self._as_tokens(obs, self.previous_action)
         with th.no_grad():
             belief, self.memory = self.encoder.step(self._tokens, self.memory, int(self.step_count.max()))
@@ -288,6 +295,16 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
         self.metrics["prediction_error"].append(np.abs(mean[:n] - truth[:n]))
         self.metrics["blur"].append(np.abs(shown[:n] - truth[:n]))
         return out
+
+    def _check_bounds(self, privileged: np.ndarray) -> None:
+        """Blurring clips to the bounds: beyond them, the policy would be shown another value than the encoder is taught."""
+        outside = (privileged < self._lowest) | (privileged > self._highest)
+        if outside.any():
+            env, dim = (int(index) for index in np.argwhere(outside)[0])
+            raise ValueError(
+                f"Privileged value {dim} of environment {env} is {privileged[env, dim]}, outside of its bounds "
+                f"{self.low[dim]} and {self.high[dim]} in the observation space, to which blurring clips: widen them."
+            )
 
     def _rewrite_terminal(self, rows: np.ndarray, infos: list[dict]) -> None:
         """Encode the last observations of episodes that were cut short with the history that they belong to."""

@@ -39,6 +39,8 @@ class KinematicQuadruped(LeglessQuadruped):
         super().__init__()
         simulation = world.simulation
         simulation.configure(SUBSTEP, gravity=0.0)
+        # Of two walls that are touched at once, the one that is solved first must not depend on the episodes before.
+        simulation.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         body = Cylinder("body", (0.0, 0.0, 0.0), BODY_RADIUS, HALF_TRUNK_HEIGHT)
         self._body = simulation.add_body(self.name, body, looks(), (0.0, 0.0, BODY_HEIGHT), mass=MASS)
         simulation.client.changeDynamics(

@@ -19,7 +19,7 @@ from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Colour, Shape
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start, Task
-from bullet_tasks.tasks.configuration import configured
+from bullet_tasks.tasks.configuration import check_positive, configured
 
 PRIVILEGED_BOUND = 0.4
 """Bound of each privileged number; a uniform distribution within has the standard deviation 0.231."""
@@ -77,9 +77,7 @@ class HoverReward:
     crash: float = -6.0
 
     def __post_init__(self) -> None:
-        for name in ("altitude_decay", "level_decay"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
+        check_positive(self, "altitude_decay", "level_decay")
 
 
 @dataclass(frozen=True)
@@ -114,22 +112,22 @@ class BiasedQuadrotorConfig:
     reward: HoverReward = field(default_factory=HoverReward)
 
     def __post_init__(self) -> None:
-        for name in ("altitude_bias", "angle_bias", "altitude_range", "angle_range", "decision_period", "time_limit"):
-            value = getattr(self, name)
-            if not (value > 0.0 and math.isfinite(value)):
-                raise ValueError(f"`{name}` must be positive and finite, got {value}.")
+        check_positive(self, "altitude_bias", "angle_bias", "altitude_range", "angle_range", "decision_period", "time_limit")
         if self.decision_period > self.time_limit:
             raise ValueError(
                 f"`decision_period` ({self.decision_period} s) must not exceed `time_limit` ({self.time_limit} s)."
             )
         least, greatest = self.start_altitude
-        if not self.altitude_bias < least <= greatest < math.inf:
+        if not self.altitude_bias < least <= greatest <= ALTITUDE_SCALE:
             raise ValueError(
-                f"`start_altitude` must be {self.altitude_bias} < least <= greatest m, got {self.start_altitude}: with the "
-                "greatest `altitude_bias` the flight must still begin above the ground."
+                f"`start_altitude` must be {self.altitude_bias} < least <= greatest <= {ALTITUDE_SCALE} m, got "
+                f"{self.start_altitude}: with the greatest `altitude_bias` the flight must still begin above the ground, and "
+                "what is read within what can be observed."
             )
-        if not 0.0 <= self.start_tilt < math.inf:
-            raise ValueError(f"`start_tilt` must be at least 0 rad, got {self.start_tilt}.")
+        if not 0.0 <= self.start_tilt <= ANGLE_SCALE:
+            raise ValueError(
+                f"`start_tilt` must be from 0 to {ANGLE_SCALE} rad, all that can be observed, got {self.start_tilt}."
+            )
         lowest, highest = self.middle_altitude - self.altitude_range, self.middle_altitude + self.altitude_range
         if not (lowest < -self.altitude_bias and highest >= self.hover.altitude + self.altitude_bias):
             raise ValueError(

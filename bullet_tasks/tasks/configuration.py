@@ -36,6 +36,18 @@ def configured(default: C, given: C | Mapping[str, Any] | None) -> C:
     return dataclasses.replace(default, **{name: _value(name, getattr(default, name), value) for name, value in given.items()})
 
 
+def check_positive(config: Any, *names: str) -> None:
+    """
+    :param config: a configuration
+    :param names: of its values that must be positive
+    :raises ValueError: for one that is not, or not finite
+    """
+    for name in names:
+        value = getattr(config, name)
+        if not (value > 0.0 and math.isfinite(value)):
+            raise ValueError(f"`{name}` must be positive and finite, got {value}.")
+
+
 def _value(name: str, default: Any, given: Any) -> Any:
     if dataclasses.is_dataclass(default):
         return configured(default, given)

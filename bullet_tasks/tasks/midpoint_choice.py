@@ -130,7 +130,7 @@ class MidpointChoice(CornerTask):
 
     Optimal behaviour
         Without the privileged observation: walk round near the corners until the heights of all columns are known, then
-        walk to the corner behind the second tallest. A simple script needs 10 s on average and up to 14 s for it, and 4 s
+        walk to the corner behind the second tallest. A simple script needs 10 s on average and up to 14.5 s for it, and 4 s
         knowing the goal.
 
     Differences from the paper and its release

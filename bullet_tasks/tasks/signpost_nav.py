@@ -16,7 +16,7 @@ from bullet_tasks.sensors.scandots import Scandots
 from bullet_tasks.shapes import Box, Colour, Cylinder, Vector3
 from bullet_tasks.simulation import Camera
 from bullet_tasks.tasks.base import Start
-from bullet_tasks.tasks.configuration import configured
+from bullet_tasks.tasks.configuration import check_positive, configured
 from bullet_tasks.tasks.navigation import NavigationReward, NavigationTask
 
 _FLOOR: Colour = (0.86, 0.87, 0.84, 1.0)
@@ -75,6 +75,7 @@ class SignpostNavConfig:
         return self.post_base_length + self.post_length_per_metre * distance
 
     def __post_init__(self) -> None:
+        check_positive(self, "privileged_scale", "privileged_bound")
         near, far = self.goal_distance
         rim = self.platform_radius - self.goal_radius
         if not 0.0 <= near <= far <= rim:
@@ -99,6 +100,9 @@ class SignpostNavConfig:
                 f"({shortest:.2f} m), as it is made of so many blocks: raise `post_base_length` or lower "
                 "`post_length_per_metre`."
             )
+        furthest = self.platform_radius + 0.5 * shortest
+        if self.post_x > furthest:
+            raise ValueError(f"`post_x` must be at most {furthest:.2f} m, where the disc ends, got {self.post_x}.")
         room = self.post_x - 0.5 * longest - BODY_RADIUS
         if not 0.0 <= self.spawn_distance <= room:
             raise ValueError(

@@ -129,7 +129,7 @@ class SquareMaze(CornerTask):
     Optimal behaviour
         Without the privileged observation: walk straight through the first junction. Stopped by a curb, turn right (towards
         -x), else left. Walk straight through the second junction as well. Stopped by a curb, go to
-        the corner with y < 0, else to the one with y > 0. A simple script needs 12 to 13 s for it, and 7 s knowing
+        the corner with y < 0, else to the one with y > 0. A simple script needs 12.2 to 13.3 s for it, and 7 s knowing
         the goal.
 
     Differences from the paper and its release

@@ -158,7 +158,8 @@ class RESeLPolicy(ContractPolicy):
         :param episode_start: which environments have just been reset, ``(n_envs,)``
         :param deterministic: the actor's mode instead of a sample
         :return: action(s) and the next state
-        :raises ValueError: for a missing key, a value that is not finite or a state of another number of environments
+        :raises ValueError: for a missing key, a value that is not finite, or a state or ``episode_start`` of another number of
+            environments or of another memory
         """
         self.set_training_mode(False)
         tokens, vectorized = self._as_tokens(observation)
@@ -168,15 +169,14 @@ class RESeLPolicy(ContractPolicy):
             memory = self.encoder.memory.initial_state(n_envs)
         else:
             previous_action = state[0].copy()
-            # A copy, because the memory is updated in place while the caller may keep the state.
-            memory = tuple(th.as_tensor(part.copy(), device=self.device) for part in state[1])
+            memory = self._as_memory(state[1], self.encoder.memory.initial_state(n_envs))
         if len(previous_action) != n_envs:
             raise ValueError(
                 f"The state holds {len(previous_action)} environments but {n_envs} observations were given: pass the state "
                 "that predict returned for the same environments, or None to start anew."
             )
         if episode_start is not None:
-            rows = np.asarray(episode_start, dtype=bool).reshape(n_envs)
+            rows = self._starts(episode_start, n_envs)
             previous_action[rows] = 0.0
             reset_rows(memory, th.as_tensor(rows, device=self.device))
         tokens[PREVIOUS_ACTION] = th.as_tensor(previous_action, device=self.device)

@@ -166,12 +166,15 @@ def test_a_belief_is_drawn_where_the_goal_is(env):
         ({"goal_distance": (3.9, 4.7)}, "on its platform"),
         ({"goal_distance": (3.9, 3.8)}, "on its platform"),
         ({"goal_distance": (4.2, 4.3)}, "privileged_scale"),
+        ({"privileged_scale": 0.0}, "privileged_scale"),
+        ({"post_distance": 0.0}, "post_distance"),
+        ({"corridor_half_width": 0.1}, "corridor_half_width"),
         ({"spawn_distance": 3.6}, "spawn_distance"),
         ({"decision_period": 0.0}, "decision_period"),
         ({"decision_period": -0.25}, "decision_period"),
         ({"time_limit": float("nan")}, "time_limit"),
         ({"time_limit": 0.1}, "must not exceed"),
-        ({"corridor_half_width": 0.0}, "half_extents"),
+        ({"block_height": 0.0}, "half_extents"),
     ],
 )
 def test_impossible_worlds_are_refused(arguments, words):

@@ -143,6 +143,8 @@ def test_a_belief_is_drawn_where_the_goal_is(env):
         ({"goal_distance": (1.3, 4.2)}, "goal_distance"),
         ({"goal_distance": (3.0, 2.0)}, "goal_distance"),
         ({"goal_distance": (1.3, 3.4)}, "privileged_scale"),
+        ({"privileged_bound": -0.4}, "privileged_bound"),
+        ({"post_x": 20.0}, "post_x"),
         ({"post_base_length": 0.0}, "post_base_length"),
         ({"post_length_per_metre": -0.1}, "post_length_per_metre"),
         ({"post_base_length": 0.1, "post_length_per_metre": 0.3}, "longest signpost.*3 times"),

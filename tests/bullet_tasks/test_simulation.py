@@ -1,5 +1,8 @@
 """Laws of the simulation: names, contacts, saved states, pictures, closing."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -52,6 +55,12 @@ def test_names_are_unique_and_unknown_ones_are_refused(simulation):
         drop(simulation)
     with pytest.raises(KeyError, match=r"no_such.*cube.*table"):
         simulation.place("no_such", (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_an_open_world_cannot_be_copied(simulation, copied):
+    with pytest.raises(TypeError, match=r"neither copied nor pickled.*compiled"):
+        copied(simulation)
 
 
 def test_a_time_step_must_be_positive(simulation):

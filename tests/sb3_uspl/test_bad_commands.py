@@ -178,6 +178,7 @@ def test_tracking_is_the_zoos(tmp_path, monkeypatch):
     ("arguments", "words"),
     [
         (("--physics", "full"), "cannot be made with.*'physics'"),
+        (("--physics", "full", "--env-kwargs", "physics:'compiled'"), "name one of them"),
         (("--seed", "-5"), "--seed -5: must be at least 0"),
         (("--n-envs", "0"), "--n-envs 0: must be at least 1"),
         (("--episodes", "0"), "--episodes 0: must be at least 1"),

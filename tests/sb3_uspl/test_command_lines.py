@@ -76,6 +76,7 @@ def test_evaluation_prints_one_json_object(logs):
     measured = json.loads(result.stdout)
     assert measured["env"] == "TargetReaching-v0" and measured["episodes"] == 6
     assert {"success_rate", "privileged_success_rate", "mean_length", "prediction_error_final"} <= set(measured)
+    assert measured["env_kwargs"] == {}
 
 
 @pytest.mark.parametrize("algo", sorted(set(ALGORITHMS) - {"uspl_ppo"}))

@@ -76,3 +76,14 @@ def test_a_state_of_other_environments_is_refused():
     _, state = model.predict({"common": np.zeros((3, 2), np.float32)})
     with pytest.raises(ValueError, match="holds 3 environments but 2"):
         model.predict({"common": np.zeros((2, 2), np.float32)}, state)
+
+
+def test_a_state_of_another_memory_is_refused():
+    _, state = make_model(policy_kwargs=dict(memory="gru")).predict({"common": np.zeros((3, 2), np.float32)})
+    with pytest.raises(ValueError, match="memory has 1 parts but this policy's has 3"):
+        make_model(policy_kwargs=dict(memory="transformer")).predict({"common": np.zeros((3, 2), np.float32)}, state)
+
+
+def test_starts_of_other_environments_are_refused():
+    with pytest.raises(ValueError, match="about 2 environments but 3 observations"):
+        make_model().predict({"common": np.zeros((3, 2), np.float32)}, None, np.ones(2, bool))

@@ -39,10 +39,25 @@ def looked_at(model):
         obs, *_ = env.step(actions)
 
 
-@pytest.mark.parametrize("use", [evaluated, looked_at])
+def stepped(model):
+    for _ in range(3):  # no episode ends
+        model.get_env().step([model.action_space.sample()] * N_ENVS)
+
+
+class SameInfo(ToyEnv):
+    """Gives the same info at every reset."""
+
+    info = {}
+
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0], self.info
+
+
+@pytest.mark.parametrize("use", [evaluated, looked_at, stepped])
+@pytest.mark.parametrize("make_env", [ToyEnv, SameInfo])
 @pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv, BulletVecEnv])
-def test_no_episode_goes_on_from_before_others_used_the_environments(use, vec_env):
-    env = make_vec_env(long_env, N_ENVS, vec_env_cls=vec_env)
+def test_no_episode_goes_on_from_before_others_used_the_environments(use, make_env, vec_env):
+    env = make_vec_env(make_env, N_ENVS, env_kwargs={"length": LENGTH}, vec_env_cls=vec_env)
     model = make_model(USPLPPO, env).learn(N_STEPS * N_ENVS)
     use(model)
     model.learn(2 * N_STEPS * N_ENVS, reset_num_timesteps=False)

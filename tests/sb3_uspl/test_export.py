@@ -30,6 +30,7 @@ CASES = {
     "transformer": (USPLPPO, "transformer", IMAGE, spaces.Discrete(3)),
     "vector": (USPLPPO, "max", VECTOR, spaces.MultiDiscrete([2, 3])),
     "categorical": (USPLPPO, "max", None, None, {"categorical": True}),
+    "number": (USPLPPO, "gru", None, spaces.Box(-1, 1, (), np.float32)),
     "resel": (RESeLPPO, "transformer", None, spaces.Box(-2, 3, (2,), np.float32)),
 }
 

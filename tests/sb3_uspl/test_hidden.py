@@ -108,10 +108,19 @@ def test_bad_parameters_are_refused():
     make = gym.make
     with pytest.raises(ValueError, match=r"no attribute 'mass'; its numbers are .*'m'"):
         HiddenParameters(make("Pendulum-v1"), {"mass": (0.5, 2.0)})
-    for values in ((2.0, 0.5), [1.0], [1.0, 1.0], (1.0, 2.0, 3.0), (0.0, np.inf), 5.0):
+    for values in ((2.0, 0.5), [1.0], [1.0, 1.0], (1.0, 2.0, 3.0), (0.0, np.inf), ["a", "b"], 5.0):
         with pytest.raises(ValueError, match=r"'m': .*expected a range"):
             HiddenParameters(make("Pendulum-v1"), {"m": values})
     with pytest.raises(ValueError, match="at least one"):
         HiddenParameters(make("Pendulum-v1"), {})
     with pytest.raises(ValueError, match="one-dimensional Box"):
-        HiddenParameters(pendulum(), {"m": (0.5, 2.0)})
+        HiddenParameters(gym.wrappers.ReshapeObservation(make("Pendulum-v1"), (3, 1)), {"m": (0.5, 2.0)})
+    with pytest.raises(ValueError, match="one of its sensors: name all"):
+        HiddenParameters(pendulum(), {"l": (0.5, 2.0)})
+    with pytest.raises(ValueError, match=r"'mass' of .* cannot be set; give the property a setter"):
+        HiddenParameters(Sealed(), {"mass": (0.5, 2.0)})
+
+
+class Sealed(gym.Env):
+    observation_space, action_space = gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(2)
+    mass = property(lambda self: 1.0)

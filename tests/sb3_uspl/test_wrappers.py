@@ -209,6 +209,17 @@ def test_bad_numbers_are_refused_at_the_first_step():
         wrapper.step(np.zeros((2, 1), np.float32))
 
 
+def test_a_privileged_value_beyond_its_bounds_is_refused_but_not_what_rounding_adds():
+    wrapper = make_wrapper(2)
+    wrapper.reset()
+    bound = float(wrapper.high[0])
+    wrapper.venv.envs[1].hidden[:] = bound * (1.0 + 1e-6)
+    wrapper.step(np.zeros((2, 1), np.float32))
+    wrapper.venv.envs[1].hidden[:] = 2.0 * bound
+    with pytest.raises(ValueError, match=rf"value 0 of environment 1 is {2.0 * bound}.*bounds .* and {bound}.*widen"):
+        wrapper.step(np.zeros((2, 1), np.float32))
+
+
 def test_discrete_actions_reach_the_encoder_one_hot():
     venv = DummyVecEnv([lambda: ToyEnv(action_space=spaces.Discrete(3))] * 2)
     wrapper = UncertaintyVecWrapper(venv, ObservationEncoder(venv.observation_space, 3), UncertaintyConfig(), 0)

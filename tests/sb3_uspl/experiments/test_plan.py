@@ -167,6 +167,13 @@ def test_a_file_keeps_only_what_it_names(tmp_path):
         load_entries(tmp_path / "heir.yml")
 
 
+def test_a_file_elsewhere_inherits_from_the_projects(tmp_path):
+    (tmp_path / "heir.yml").write_text("inherit: uspl_ppo.yml\n")
+    assert load_entries(tmp_path / "heir.yml") == load_entries(CONFIGS / "uspl_ppo.yml")
+    (tmp_path / "uspl_ppo.yml").write_text("A: {x: 1}\n")
+    assert load_entries(tmp_path / "heir.yml") == {"A": {"x": 1}}
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
