@@ -12,6 +12,18 @@ import traceback
 import torch as th
 
 
+def _let_go_of_files():
+    """
+    As Popen does: a child that outlives the runner must not hold its lock. But the numbers stay taken, as the parent's objects
+    close them when they are collected here, too, whosever they are by then.
+    """
+    null = os.open(os.devnull, os.O_RDWR)
+    for number in range(3, 1024):
+        with contextlib.suppress(OSError):
+            os.fstat(number)
+            os.dup2(null, number)
+
+
 class ForkedChild:
     """``python -m <arguments>``, like ``subprocess.Popen`` as far as the runner uses it."""
 
@@ -28,7 +40,7 @@ class ForkedChild:
         th.set_num_threads(1)
         for stream in (1, 2):
             os.dup2(log.fileno(), stream)
-        os.closerange(3, 1024)  # as Popen does: a child that outlives the runner must not hold its lock
+        _let_go_of_files()
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         sys.argv = [arguments[0], *arguments[1:]]
         try:
