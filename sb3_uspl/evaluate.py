@@ -118,7 +118,7 @@ def main() -> None:
         except (ValueError, ModuleNotFoundError) as error:
             raise SystemExit(str(error)) from error
     if arguments.json:
-        print(json.dumps(result))
+        print(json.dumps(result, default=repr))  # the environment's arguments may be anything
     else:
         _print_table(result)
 

@@ -192,7 +192,8 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
         self.rng = np.random.default_rng(seed)
         space = venv.observation_space[PRIVILEGED]  # type: ignore[index]
         self.low, self.high = space.low, space.high
-        tolerance = _OUTSIDE * (np.where(np.isfinite(space.high - space.low), space.high - space.low, 0.0))
+        width = space.high - space.low
+        tolerance = np.where(np.isfinite(width), _OUTSIDE * width, 0.0)
         self._lowest, self._highest = space.low - tolerance, space.high + tolerance
         self.noise = BlurNoise(self.num_envs, space.shape[0], config, self.rng)
         self.metrics: dict[str, list[np.ndarray]] = defaultdict(list)
@@ -274,7 +275,8 @@ class UncertaintyVecWrapper(ExperienceVecWrapper):
     def _observe(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Encode the current observation of all environments and build what the policy sees."""
         check_finite(obs)
-        self._check_bounds(obs[PRIVILEGED])
+        if self.config.blur:
+            self._check_bounds(obs[PRIVILEGED])
         self._tokens = self._as_tokens(obs, self.previous_action)
         with th.no_grad():
             belief, self.memory = self.encoder.step(self._tokens, self.memory, int(self.step_count.max()))

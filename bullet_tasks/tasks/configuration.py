@@ -38,7 +38,7 @@ def configured(default: C, given: C | Mapping[str, Any] | None) -> C:
 
 def check_positive(config: Any, *names: str) -> None:
     """
-    :param config: a configuration
+    :param config: a configuration, or a task
     :param names: of its values that must be positive
     :raises ValueError: for one that is not, or not finite
     """

@@ -14,6 +14,7 @@ from bullet_tasks.robots.quadruped_body import WALKING_SPEED, QuadrupedCommand
 from bullet_tasks.scene import SceneSpec
 from bullet_tasks.shapes import Box, Shape
 from bullet_tasks.tasks.base import Outcome, Task
+from bullet_tasks.tasks.configuration import check_positive
 
 POSITION_SCALE = 8.0
 """Positions are observed in units of this length, m (the authors' release)."""
@@ -60,14 +61,12 @@ class NavigationTask(Task):
     """
 
     def __init__(self, decision_period: float, time_limit: float, goal_radius: float, reward: NavigationReward) -> None:
-        for name, value in (("decision_period", decision_period), ("time_limit", time_limit), ("goal_radius", goal_radius)):
-            if not (value > 0.0 and math.isfinite(value)):
-                raise ValueError(f"`{name}` must be positive and finite, got {value}.")
-        if decision_period > time_limit:
-            raise ValueError(f"`decision_period` ({decision_period} s) must not exceed `time_limit` ({time_limit} s).")
         self.decision_period = decision_period
         self.time_limit = time_limit
         self.goal_radius = goal_radius
+        check_positive(self, "decision_period", "time_limit", "goal_radius")
+        if decision_period > time_limit:
+            raise ValueError(f"`decision_period` ({decision_period} s) must not exceed `time_limit` ({time_limit} s).")
         self.reward = reward
         self.goal = (0.0, 0.0)
         self.dead_zones: tuple[tuple[float, float], ...] = ()

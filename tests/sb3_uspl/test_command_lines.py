@@ -20,7 +20,7 @@ from sb3_uspl import RESeLPolicy, USPLPolicy
 from sb3_uspl._configs import CONFIGS, load_entries
 from sb3_uspl._zoo import ALGORITHMS, TRAINED_AGENTS, ProgressCSV, is_ours, use_default_config, use_default_folder
 from tests.sb3_uspl.commands import ENV, run, run_apart, train
-from tests.sb3_uspl.test_uspl_ppo import make_model
+from tests.sb3_uspl.toy import make_model
 
 
 @pytest.fixture(scope="module")

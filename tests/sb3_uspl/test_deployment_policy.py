@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.sb3_uspl.test_uspl_ppo import make_model, make_venv
-from tests.sb3_uspl.toy import IMAGE
+from tests.sb3_uspl.toy import IMAGE, make_model, make_venv
 
 
 @pytest.mark.parametrize("memory", ["gru", "transformer"])

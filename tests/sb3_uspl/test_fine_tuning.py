@@ -11,7 +11,7 @@ from sb3_uspl import USPLPPO, RESeLPPO
 from sb3_uspl._zoo import TRAINED_AGENTS
 from sb3_uspl.buffers import EpisodeReplayBuffer
 from tests.sb3_uspl.commands import run
-from tests.sb3_uspl.test_uspl_ppo import make_model, make_venv
+from tests.sb3_uspl.toy import make_model, make_venv
 
 ENV = "LateralChoice-v0"
 SHIPPED = TRAINED_AGENTS / "uspl_ppo" / f"{ENV}_1" / f"{ENV}.zip"

@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_uspl import USPLPPO
-from tests.sb3_uspl.test_uspl_ppo import make_model
+from tests.sb3_uspl.toy import make_model
 
 
 @pytest.mark.parametrize("chosen", [{1: 0.0}, {-1: 0.0}, {0: 1.5}, {0: np.nan}, {}, [0]], ids=str)

@@ -1,8 +1,12 @@
-"""A tiny environment under the observation contract, configurable in every respect that the learner depends on."""
+"""A tiny environment under the observation contract, configurable in every respect that the learner depends on; its models."""
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_uspl import USPLPPO
 
 IMAGE = spaces.Box(0, 255, (1, 40, 40), np.uint8)
 
@@ -43,3 +47,23 @@ class ToyEnv(gym.Env):
         if target is not None:
             obs["target"] = np.full(target.shape, 100 + self.t, target.dtype)
         return obs
+
+
+FAST = dict(n_steps=16, batch_size=32, n_epochs=2, encoder_updates=2, encoder_batch_size=64, seed=0)
+
+
+def make_venv(n_envs=8, seed=0, **kwargs):
+    return make_vec_env(ToyEnv, n_envs, seed=seed, env_kwargs=kwargs)
+
+
+def make_model(n_envs=8, policy="MlpPolicy", algorithm=USPLPPO, env_kwargs=None, **kwargs):
+    return algorithm(policy, make_venv(n_envs, **(env_kwargs or {})), **{**FAST, **kwargs})
+
+
+def parameters(model):
+    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+def assert_equal_parameters(a, b, only=""):
+    names = [name for name in a if name.startswith(only)]
+    assert names and all(th.equal(a[name], b[name]) for name in names)
